@@ -13,7 +13,8 @@ from torch import Tensor
 
 from torchsar import plot
 from torchsar.core import Axis, Signal
-from torchsar.focus import Detect, FocusStrip, QuickLook, StripPlan, focus_block
+from torchsar.focus import Detect, FocusStrip, QuickLook
+from torchsar.focus.strip import StripPlan, focus_block
 from torchsar.io import StripImage, write_strip_geotiff
 from torchsar.io.strip import StripRecording, samples_checksum
 from torchsar.study.output.folder import ResultFolder, fresh_result, opened

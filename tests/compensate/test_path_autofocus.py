@@ -18,7 +18,8 @@ from torchsar.compensate.path.joint import Found
 from torchsar.compensate.path.search import Starts
 from torchsar.core import Draws, Estimate, Outcome, Recording, unit_phasor
 from torchsar.echo import simulate_path
-from torchsar.focus import ImageGrid, TileImage, TileOperator, TilePlan
+from torchsar.focus import ImageGrid, TileImage, TilePlan
+from torchsar.focus.tile_operator import TileOperator
 from torchsar.metrics import phase_rmse, registered_error_db
 from torchsar.radar import AntennaPath, InverseRadar
 from torchsar.scene import Flight, Navigation, PathWorld, RandomPoints, RandomWalk, Sinusoid, StraightPath, Sway

@@ -11,7 +11,8 @@ from tests.direct.bistatic import C, Survey, echo
 from tests.direct.test_stripmap import peak
 from torchsar.core import Chain, Draws, Signal, use
 from torchsar.echo import simulate_bistatic
-from torchsar.focus import flat_reference, range_compress
+from torchsar.focus import range_compress
+from torchsar.focus.reference import flat_reference
 from torchsar.metrics import azimuth_response
 from torchsar.multichannel import (
     CompressChannels,

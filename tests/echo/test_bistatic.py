@@ -9,7 +9,8 @@ import torch
 
 from torchsar.core import Draws
 from torchsar.echo import bistatic_echo, simulate_bistatic
-from torchsar.focus import flat_reference, matched_reference, range_compress
+from torchsar.focus import range_compress
+from torchsar.focus.reference import flat_reference, matched_reference
 from torchsar.radar import BistaticRadar, LinearFM, Orbit, range_coefficients, seen_point
 from torchsar.scene import (
     BandLimited,

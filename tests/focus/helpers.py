@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchsar.core import Draws, Signal
 from torchsar.echo import simulate
-from torchsar.focus import flat_reference
+from torchsar.focus.reference import flat_reference
 from torchsar.radar import LinearFM, StripmapRadar
 from torchsar.scene import Dwell, Points, StripmapWorld
 

@@ -5,15 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchsar.focus import (
-    DopplerBand,
-    Integration,
-    OmegaKStolt,
-    backproject_strip,
-    omega_k,
-    omega_k_stolt,
-    range_doppler,
-)
+from torchsar.focus import OmegaKStolt, backproject_strip, omega_k, omega_k_stolt, range_doppler
 from torchsar.radar import LinearFM, StripmapRadar
 
 RADAR = StripmapRadar(3.2e9, LinearFM(40e6, 0.2e-6), 50e6, 400.0, 120.0, 2000.0)
@@ -74,7 +66,7 @@ def test_backprojected_batch_equals_singles_and_blocks_do_not_matter():
     raw = torch.randn(2, 40, 64, dtype=torch.complex128)
     x, r = torch.linspace(3, 9, 5, dtype=torch.float64)[:, None], 2000 + torch.linspace(20, 120, 7, dtype=torch.float64)
     velocity = torch.tensor([120.0, 100.0], dtype=torch.float64)
-    kw = {"doppler_hz": 3.0, "aperture": Integration(0.05)}
+    kw = {"doppler_hz": 3.0, "aperture": lambda since, _: since.abs() <= 0.025}
     batch = backproject_strip(raw, RADAR, x, r, velocity_m_s=velocity, **kw)
     assert batch.shape == (2, 5, 7)
     for i in range(2):
@@ -86,10 +78,17 @@ def test_backprojected_batch_equals_singles_and_blocks_do_not_matter():
 def test_apertures_limit_the_pulses():
     raw = torch.ones(40, 64, dtype=torch.complex128)
     x, r = torch.tensor(6.0, dtype=torch.float64), torch.tensor(2060.0, dtype=torch.float64)
-    some = backproject_strip(raw, RADAR, x, r, doppler_hz=0.0, aperture=Integration(11 / 400))
+    some = backproject_strip(raw, RADAR, x, r, doppler_hz=0.0, aperture=lambda since, _: since.abs() <= 11 / 800)
     mask = ((torch.arange(40) / 400 - 6.0 / 120).abs() <= 5.5 / 400)[:, None]
     torch.testing.assert_close(some, backproject_strip(raw * mask, RADAR, x, r, doppler_hz=0.0))
-    assert abs(backproject_strip(raw, RADAR, x, r, doppler_hz=300.0, frame_hz=0.0, aperture=DopplerBand(50.0))) == 0
+    assert (
+        abs(
+            backproject_strip(
+                raw, RADAR, x, r, doppler_hz=300.0, frame_hz=0.0, aperture=lambda _, offset: offset.abs() <= 25
+            )
+        )
+        == 0
+    )
 
 
 def test_a_processed_band_removes_other_doppler_and_warns_beyond_the_prf():

@@ -93,7 +93,7 @@ def test_several_azimuths_in_a_narrow_beam():
 @pytest.mark.parametrize(
     "bad, message",
     [
-        ({"speed_m_s": math.nan}, "speed_m_s must be a finite number"),
+        ({"speed_m_s": math.nan}, "speed_m_s must be a finite non-negative number"),
         ({"ranges": (2.0, 1.0)}, "least, largest"),
         ({"jerk_m_s3": -1.0}, "jerk_m_s3"),
     ],

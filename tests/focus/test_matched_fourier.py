@@ -23,12 +23,10 @@ from torchsar.focus import (
     MatchedFourierOperator,
     RangePhase,
     Resampling,
-    cross_range_of,
-    lines_for,
     matched_fourier,
-    mean_rate,
     range_phase,
 )
+from torchsar.focus.image_lines import cross_range_of, lines_for, mean_rate
 from torchsar.focus.warped_sums import times_of_even_angle
 from torchsar.metrics import entropy
 from torchsar.radar import LIGHT_M_S, InverseRadar

@@ -112,7 +112,8 @@ def test_the_first_order_loses_what_the_second_corrects() -> None:
 def test_points_at_the_compensated_angle_lose_least() -> None:
     plan = STRIPS["drone"].plan()
     assert plan.predicted_db(torch.ones_like) == pytest.approx(plan.predicted_db())
-    sine = math.sqrt(1 - plan.beam.mean_cosine**2)
+    sines, share = plan.beam.quadrature()
+    sine = math.sqrt(1 - float((share * (1 - sines.square()).sqrt()).sum()) ** 2)
     assert plan.predicted_db(lambda s: torch.exp(-(((s.abs() - sine) / 0.005) ** 2))) < plan.predicted_db() - 6
 
 

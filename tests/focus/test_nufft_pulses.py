@@ -9,7 +9,7 @@ import math
 import pytest
 import torch
 
-from torchsar.focus.gridding import PulseNufft, correlate_rows, interpolate_rows, spread_rows
+from torchsar.focus.gridding import PulseNufft, trilinear
 from torchsar.focus.nufft import Kernel
 
 
@@ -111,14 +111,14 @@ def test_parts_of_the_trilinear_form_are_each_others_gradients():
     )
     first = torch.tensor([[0, 2, 2, 5, 6], [6, 1, 0, 3, 3]])
     for function, parts in (
-        (lambda w, v: spread_rows(w, v, first, 9), (weights, values)),
-        (lambda w, g: interpolate_rows(w, g, first), (weights, grid)),
-        (lambda v, g: correlate_rows(v, g, first, 3), (values, grid)),
+        (lambda w, v: trilinear("grid", 9, first, w, v), (weights, values)),
+        (lambda w, g: trilinear("values", 0, first, w, g), (weights, grid)),
+        (lambda v, g: trilinear("weights", 3, first, v, g), (values, grid)),
     ):
         assert torch.autograd.gradcheck(function, parts) and torch.autograd.gradgradcheck(function, parts)
-    total = (spread_rows(weights, values, first, 9) * grid).sum()
-    torch.testing.assert_close((interpolate_rows(weights, grid, first) * values).sum(), total)
-    torch.testing.assert_close((correlate_rows(values, grid, first, 3) * weights).sum(), total)
+    total = (trilinear("grid", 9, first, weights, values) * grid).sum()
+    torch.testing.assert_close((trilinear("values", 0, first, weights, grid) * values).sum(), total)
+    torch.testing.assert_close((trilinear("weights", 3, first, values, grid) * weights).sum(), total)
 
 
 @pytest.mark.parametrize("taps", [4, 7])

@@ -11,7 +11,8 @@ import torch
 
 from torchsar import Chain, use
 from torchsar.core import Recording, Signal
-from torchsar.focus import GroundGrid, SpotlightBackprojection, backproject_spotlight
+from torchsar.focus import SpotlightBackprojection, backproject_spotlight
+from torchsar.focus.spotlight import GroundGrid
 from torchsar.io import read_inverse
 from torchsar.metrics import contrast, entropy, error_db
 from torchsar.radar import (

@@ -10,7 +10,8 @@ import torch
 from tests.contract.pretended import DEVICE, pretended_device, to_device, to_host
 from tests.io.scenes import POINT, recorded
 from torchsar.core import Chain, use
-from torchsar.focus import SpotlightImage, TileImage, scene_grid
+from torchsar.focus import SpotlightImage, TileImage
+from torchsar.focus.spotlight_image import scene_grid
 from torchsar.radar import LIGHT_M_S, AntennaPath
 
 RECORDED = {both: recorded(both) for both in (False, True)}

@@ -19,7 +19,6 @@ from torchsar.focus import (
     OmegaK,
     OmegaKStolt,
     QuickLook,
-    StripPlan,
     amplitude,
     focus_strip,
     multilook,
@@ -29,7 +28,7 @@ from torchsar.focus import (
     to_db,
     write_strip,
 )
-from torchsar.focus.strip import ARRAYS
+from torchsar.focus.strip import ARRAYS, StripPlan
 from torchsar.radar import LinearFM, StripmapRadar
 from torchsar.scene import Dwell, Points, StripmapWorld
 

@@ -18,7 +18,7 @@ from tests.focus.geometries import C128, F64, C, Case, case
 from tests.helpers import assert_forward_equals_backward
 from torchsar.focus import ImageGrid, ProcessedBeam, TilePlan, backproject, image_tiles
 from torchsar.focus.tiles import plan as of_plan
-from torchsar.focus.tiles.choice import _pixel_rule
+from torchsar.focus.tiles.scene import _pixel_rule
 from torchsar.radar import LIGHT_M_S
 
 

@@ -12,15 +12,8 @@ from torch import Tensor
 
 from tests.echo.ladars import DOUBLE, direct_sweeps, table1
 from torchsar.core import Axis, Signal
-from torchsar.focus import (
-    AzimuthMatchedFilter,
-    CompressSweeps,
-    azimuth_matched_filter,
-    compress_sweeps,
-    deramp_azimuth,
-    profile_axes,
-)
-from torchsar.focus.triangular import video_filter
+from torchsar.focus import AzimuthMatchedFilter, CompressSweeps, azimuth_matched_filter, compress_sweeps, deramp_azimuth
+from torchsar.focus.triangular import profile_axes, video_filter
 from torchsar.scene import Polynomial, Scatterers
 
 RADAR = table1(speed_m_s=0.0)

@@ -17,6 +17,7 @@ from tests.table.stages import RADAR
 from torchsar import compensate, core, echo, focus, multichannel, radar, repair, scene
 from torchsar.core import Signal
 from torchsar.echo.stripmap import Placed
+from torchsar.focus.stored_omega_k import InvertibleOmegaK
 
 DOUBLE, F64 = torch.complex128, torch.float64
 ALL = [entry for entry in ENTRIES if not entry.kind.startswith("one ") and not entry.joint]
@@ -144,7 +145,7 @@ PAIRS = [
     Pair(
         "omega-K and its inverse",
         lambda x: focus.omega_k(x, RADAR, doppler_hz=5.0),
-        lambda y: focus.defocus_omega_k(y, RADAR, doppler_hz=5.0),
+        lambda y: InvertibleOmegaK(RADAR, y, doppler_hz=5.0).defocus(y),
         (24, 64),
         (24, 64),
     ),

@@ -12,8 +12,9 @@ from torch import Tensor
 from tests.helpers import small_radar, small_recording
 from torchsar.core import Chain, Draws, Recording, Signal, use
 from torchsar.echo import LostGaps, LostLines, apply_impairments, simulate
-from torchsar.focus import InvertibleOmegaK, OmegaK, defocus_omega_k, matched_reference, omega_k
-from torchsar.focus.defocus import all_pass
+from torchsar.focus import OmegaK, omega_k
+from torchsar.focus.reference import matched_reference
+from torchsar.focus.stored_omega_k import InvertibleOmegaK, all_pass
 from torchsar.io import read_stripmap
 from torchsar.metrics import correlation, error_db
 from torchsar.repair import (
@@ -129,7 +130,7 @@ def test_defocus_inverts_and_is_the_adjoint(doppler: float) -> None:
     geometry = {"doppler_hz": torch.tensor([doppler, doppler + 11.0]), "velocity_m_s": torch.tensor([120.0, 123.0])}
     for used in (None, all_pass(reference)):
         image = omega_k(x, RADAR, reference=used, **geometry)
-        assert (error_db(defocus_omega_k(image, RADAR, reference=used, **geometry), x) < -250).all()
+        assert (error_db(InvertibleOmegaK(RADAR, image, reference=used, **geometry).defocus(image), x) < -250).all()
     operator = InvertibleOmegaK(RADAR, x, reference=reference, **geometry)
     y = torch.randn(x.shape, dtype=x.dtype, generator=torch.Generator().manual_seed(2))
     torch.testing.assert_close(operator.focus(x), omega_k(x, RADAR, reference=reference, **geometry))

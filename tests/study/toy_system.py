@@ -16,8 +16,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Axis, Draws, Estimate, Outcome, Recording, Signal, Stage, Trace, unit_phasor
-from torchsar.focus.ladar_requirements import Limit
-from torchsar.focus.requirements import Requirement
+from torchsar.focus.requirements import Limit, Requirement
 from torchsar.metrics.bounds import tone_frequency_bound_hz
 from torchsar.study.settings.signature import Catalogue
 from torchsar.study.trials.batch import Batch, Judged, Trials

@@ -36,6 +36,7 @@ from torchsar.compensate.group import RangeGroup
 from torchsar.compensate.point import peak_time_s
 from torchsar.core import Draws, Estimate, Signal, Stage
 from torchsar.echo.turntable import fast_time_axis
+from torchsar.focus.reference import matched_reference
 from torchsar.multichannel.body import find_body
 from torchsar.multichannel.velocity.along_track import along_track_velocity
 from torchsar.multichannel.velocity.likelihood import explained_energy, maximum_likelihood
@@ -617,7 +618,7 @@ FUNCTIONS = [
     _entry(
         "focus.range_compress",
         "raw",
-        lambda x: focus.range_compress(x, focus.matched_reference(RADAR.pulse, x.shape[-1], RADAR.sampling_hz)),
+        lambda x: focus.range_compress(x, matched_reference(RADAR.pulse, x.shape[-1], RADAR.sampling_hz)),
     ),
     _entry(
         "focus.compress_dechirped",
@@ -671,12 +672,6 @@ FUNCTIONS = [
     _entry("focus.omega_k", "raw", lambda x: focus.omega_k(x, RADAR, **DOPPLER), laws=Laws(range=ON_RANGE, energy=1)),
     _entry("focus.omega_k_stolt", "raw", lambda x: focus.omega_k_stolt(x, RADAR, **DOPPLER), laws=Laws(range=ON_RANGE)),
     _entry("focus.range_doppler", "raw", lambda x: focus.range_doppler(x, RADAR, **DOPPLER), laws=Laws(range=ON_RANGE)),
-    _entry(
-        "focus.defocus_omega_k",
-        "image",
-        lambda x: focus.defocus_omega_k(x, RADAR, **DOPPLER),
-        laws=Laws(range=ON_RANGE, energy=1),
-    ),
     _entry("focus.closest_range", "image", lambda x: focus.closest_range(x, RADAR, 5.0), laws=Laws(range=ON_RANGE)),
     # metrics
     _entry("metrics.entropy", "image", metrics.entropy, 0, least=0.01, laws=RANGE_FREE),

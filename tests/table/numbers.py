@@ -15,8 +15,9 @@ import torch
 
 from tests.table.functions import F64, REBUILD, ramp
 from tests.table.stages import BISTATIC, LADAR, RADAR, TURNTABLE
-from torchsar import compensate, core, echo, focus, metrics, multichannel, radar, repair, scene
+from torchsar import compensate, core, echo, metrics, multichannel, radar, repair, scene
 from torchsar.core import Draws, Stage
+from torchsar.focus import image_lines, reference
 from torchsar.multichannel.azimuth import azimuth_filter
 from torchsar.multichannel.reconstruct import band_matrix
 from torchsar.radar.bistatic import polynomial_range, receive_range
@@ -64,7 +65,6 @@ REASONS: dict[str, str] = {
     "focus.focus_block": "runs a stage on one block of lines; tests/focus/test_strip.py",
     "focus.write_strip": "writes a file; tests/focus/test_strip.py",
     "focus.plan_strip": "counts lines and bytes; tests/focus/test_strip.py",
-    "focus.recommended_form": "takes requirements only",
     "radar.range_coefficients": "works on an Orbit, whose class checks it; tests/scene/test_orbit.py",
     "radar.seen_point": "works on a satellite's position; tests/scene/test_orbit.py",
     "radar.sweep_middles": "reads an axis that the radar has made",
@@ -238,21 +238,24 @@ NUMBERS: dict[str, tuple[Callable, dict[str, Any]]] = {
     "multichannel.noise_gain_db": (_moving(multichannel.noise_gain_db, rebuild=REBUILD), MOTION),
     "multichannel.doppler_offsets": (lambda prf_hz: multichannel.doppler_offsets(8, 3, prf_hz), {"prf_hz": 180.0}),
     "focus.cross_range_of": (
-        lambda **given: focus.cross_range_of(k=WARP, **given),
+        lambda **given: image_lines.cross_range_of(k=WARP, **given),
         {"doppler_hz": ONES, "omega_rad_s": 0.3, "wavelength_m": 0.03, "duration_s": 0.1},
     ),
-    "focus.mean_rate": (lambda **given: focus.mean_rate(k=WARP, **given), {"omega_rad_s": 0.3, "duration_s": 0.1}),
-    "focus.lines_for": (focus.lines_for, {"cells": 5.0, "oversampling": 2.0}),
+    "focus.mean_rate": (
+        lambda **given: image_lines.mean_rate(k=WARP, **given),
+        {"omega_rad_s": 0.3, "duration_s": 0.1},
+    ),
+    "focus.lines_for": (image_lines.lines_for, {"cells": 5.0, "oversampling": 2.0}),
     "focus.flat_reference": (
-        lambda sampling_hz: focus.flat_reference(RADAR.pulse, 64, sampling_hz),
+        lambda sampling_hz: reference.flat_reference(RADAR.pulse, 64, sampling_hz),
         {"sampling_hz": 5e7},
     ),
     "focus.matched_reference": (
-        lambda sampling_hz: focus.matched_reference(RADAR.pulse, 64, sampling_hz),
+        lambda sampling_hz: reference.matched_reference(RADAR.pulse, 64, sampling_hz),
         {"sampling_hz": 5e7},
     ),
     "focus.phase_reference": (
-        lambda sampling_hz: focus.phase_reference(RADAR.pulse, 64, sampling_hz),
+        lambda sampling_hz: reference.phase_reference(RADAR.pulse, 64, sampling_hz),
         {"sampling_hz": 5e7},
     ),
     "metrics.beam_centre_bound_hz": (

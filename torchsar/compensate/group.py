@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from torchsar.core import fft_lines, per_trial, power_of, unit_level
-from torchsar.focus.omega_k import FrameGeometry, FrequencyBasis, bulk_filter, refocus, refocus_turns_per_sample
+from torchsar.focus.frame_geometry import FrameGeometry
+from torchsar.focus.omega_k import FrequencyBasis, bulk_filter, refocus, refocus_turns_per_sample
 from torchsar.focus.reference import range_compress
 from torchsar.radar import StripmapRadar
 

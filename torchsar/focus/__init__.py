@@ -4,12 +4,11 @@ from torchsar.focus.backprojection import backproject
 from torchsar.focus.chirp_z import chirp_z, keystone
 from torchsar.focus.coordinates import ClosestRange, PaddedLines, closest_range
 from torchsar.focus.dechirped import AzimuthTransform, CompressDechirped, azimuth_transform, compress_dechirped
-from torchsar.focus.defocus import InvertibleOmegaK, defocus_omega_k
-from torchsar.focus.detection import Detect, QuickLook, amplitude, multilook, quicklook_looks, to_db
+from torchsar.focus.detection import Detect, QuickLook, amplitude, multilook, to_db
 from torchsar.focus.image_grid import ImageGrid
-from torchsar.focus.image_lines import CrossRangeLines, DopplerLines, cross_range_of, lines_for, mean_rate
+from torchsar.focus.image_lines import CrossRangeLines, DopplerLines
 from torchsar.focus.inverse_requirements import inverse_requirements
-from torchsar.focus.ladar_requirements import Limit, ladar_limits, ladar_requirements
+from torchsar.focus.ladar_requirements import ladar_limits, ladar_requirements
 from torchsar.focus.matched_fourier import (
     MatchedFourier,
     MatchedFourierOperator,
@@ -17,27 +16,22 @@ from torchsar.focus.matched_fourier import (
     matched_fourier,
     range_phase,
 )
-from torchsar.focus.motion_compensation import MotionCompensation, ProcessedBeam, compensated_omega_k
-from torchsar.focus.nufft import Nufft, nufft_type1, nufft_type2
-from torchsar.focus.omega_k import OmegaK, StoredOmegaK, omega_k
+from torchsar.focus.motion_compensation import MotionCompensation, compensated_omega_k
+from torchsar.focus.nufft import nufft_type1, nufft_type2
+from torchsar.focus.omega_k import OmegaK, omega_k
 from torchsar.focus.path_image import DirectImage, OmegaKImage, PathImage, TileImage
 from torchsar.focus.polar import PolarFormat, PolarOperator
+from torchsar.focus.processed_beam import ProcessedBeam
 from torchsar.focus.range_doppler import RangeDoppler, range_doppler
-from torchsar.focus.reference import RangeCompress, flat_reference, matched_reference, phase_reference, range_compress
-from torchsar.focus.requirements import Requirement, recommended_form, requirements
-from torchsar.focus.spotlight import GroundGrid, SpotlightBackprojection, backproject_spotlight
-from torchsar.focus.spotlight_image import SceneGrid, SpotlightImage, scene_grid
+from torchsar.focus.reference import RangeCompress, range_compress
+from torchsar.focus.requirements import requirements
+from torchsar.focus.spotlight import SpotlightBackprojection, backproject_spotlight
+from torchsar.focus.spotlight_image import SpotlightImage
 from torchsar.focus.stolt import OmegaKStolt, omega_k_stolt
-from torchsar.focus.strip import FocusStrip, StripPlan, focus_block, focus_strip, plan_strip, reach_lines, write_strip
-from torchsar.focus.strip_backprojection import (
-    Backproject,
-    DopplerBand,
-    EveryPulse,
-    Integration,
-    backproject_strip,
-)
+from torchsar.focus.stored_omega_k import StoredOmegaK
+from torchsar.focus.strip import FocusStrip, focus_strip, plan_strip, reach_lines, write_strip
+from torchsar.focus.strip_backprojection import Backproject, backproject_strip
 from torchsar.focus.target import TargetImage
-from torchsar.focus.tile_operator import TileOperator
 from torchsar.focus.tiles import TilePlan, image_tiles
 from torchsar.focus.transforms import CompiledNufft, ExplicitSum, Gridding, Resampling
 from torchsar.focus.triangular import (
@@ -47,7 +41,6 @@ from torchsar.focus.triangular import (
     azimuth_matched_filter,
     compress_sweeps,
     deramp_azimuth,
-    profile_axes,
 )
 
 __all__ = [
@@ -62,21 +55,14 @@ __all__ = [
     "DerampAzimuth",
     "Detect",
     "DirectImage",
-    "DopplerBand",
     "DopplerLines",
-    "EveryPulse",
     "ExplicitSum",
     "FocusStrip",
     "Gridding",
-    "GroundGrid",
     "ImageGrid",
-    "Integration",
-    "InvertibleOmegaK",
-    "Limit",
     "MatchedFourier",
     "MatchedFourierOperator",
     "MotionCompensation",
-    "Nufft",
     "OmegaK",
     "OmegaKImage",
     "OmegaKStolt",
@@ -89,16 +75,12 @@ __all__ = [
     "RangeCompress",
     "RangeDoppler",
     "RangePhase",
-    "Requirement",
     "Resampling",
-    "SceneGrid",
     "SpotlightBackprojection",
     "SpotlightImage",
     "StoredOmegaK",
-    "StripPlan",
     "TargetImage",
     "TileImage",
-    "TileOperator",
     "TilePlan",
     "amplitude",
     "azimuth_matched_filter",
@@ -111,37 +93,25 @@ __all__ = [
     "compensated_omega_k",
     "compress_dechirped",
     "compress_sweeps",
-    "cross_range_of",
-    "defocus_omega_k",
     "deramp_azimuth",
-    "flat_reference",
-    "focus_block",
     "focus_strip",
     "image_tiles",
     "inverse_requirements",
     "keystone",
     "ladar_limits",
     "ladar_requirements",
-    "lines_for",
     "matched_fourier",
-    "matched_reference",
-    "mean_rate",
     "multilook",
     "nufft_type1",
     "nufft_type2",
     "omega_k",
     "omega_k_stolt",
-    "phase_reference",
     "plan_strip",
-    "profile_axes",
-    "quicklook_looks",
     "range_compress",
     "range_doppler",
     "range_phase",
     "reach_lines",
-    "recommended_form",
     "requirements",
-    "scene_grid",
     "to_db",
     "write_strip",
 ]

@@ -1,9 +1,9 @@
 """Non-uniform FFT along pulses, with the same points for all range cells.
 
-A point is the frequency at which a pulse is evaluated. The transform needs three operations:
-`spread_rows` spreads pulses onto a uniform grid, `interpolate_rows` interpolates the grid at the
-points, and `correlate_rows` gives the derivative of the other two with respect to the kernel
-weights. They are the partial derivatives of the sum, over point m, tap and column, of
+A point is the frequency at which a pulse is evaluated. The transform needs three operations: to
+spread pulses onto a uniform grid, to interpolate the grid at the points, and the derivative of the
+other two with respect to the kernel weights. They are the partial derivatives (`trilinear`) of the
+sum, over point m, tap and column, of
 
     weights[m, tap] * values[m, column] * grid[first[m] + tap, column]
 
@@ -19,7 +19,9 @@ Reference:
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,60 +30,59 @@ from torch import Tensor
 from torch.nn.functional import embedding_bag
 
 from torchsar.core import block_bytes_of, host_largest, host_value, is_traced, over_blocks, real_dtype
-from torchsar.focus.nufft import Kernel, smooth_length
+from torchsar.focus.nufft import Kernel
 
 # the three factors of the trilinear form, in the order of the arguments of `_Trilinear`
 _PARTS = ("weights", "values", "grid")
 
 
-def spread_rows(weights: Tensor, values: Tensor, first: Tensor, length: int) -> Tensor:
-    """Add weights[m, tap] * values[m] onto row first[m] + tap of a grid.
+class LinearMap(torch.autograd.Function):
+    """A linear map of a tensor, given as two functions: the map, and its adjoint for gradients.
 
-    Fastest where `first` rises along m. Differentiable any number of times in weights and values.
+    Both take and return tensors with one leading dimension of trials. Differentiable any number of
+    times; what the functions hold is constant.
+    """
+
+    @staticmethod
+    def forward(x: Tensor, forth: Callable[[Tensor], Tensor], back: Callable[[Tensor], Tensor]) -> Tensor:
+        return forth(x)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
+        ctx.forth, ctx.back = inputs[1:]
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return LinearMap.apply(gradient, ctx.back, ctx.forth), None, None
+
+    @staticmethod
+    def jvp(ctx: Any, tangent: Tensor, *_: None) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return LinearMap.apply(tangent, ctx.forth, ctx.back)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple, x: Tensor, forth: Callable, back: Callable) -> tuple[Tensor, int]:
+        every = LinearMap.apply(_in_front(x, in_dims[0], info.batch_size), forth, back)
+        return every.unflatten(0, (info.batch_size, -1)), 0
+
+
+def trilinear(wanted: str, size: int, first: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    """Compute one partial derivative of the trilinear form, see the head of this module.
+
+    Differentiable any number of times in the two factors.
 
     Args:
-        weights: Tap weights, shape (b, m, tap), real.
-        values: Rows of values, shape (b, m, column), real.
+        wanted: "grid" to spread values (fastest where `first` rises along m), "values" to
+            interpolate a grid, "weights" to correlate values with a grid.
+        size: Number of grid rows of "grid" or of taps of "weights"; not used for "values".
         first: First grid row of each point, shape (b, m), int64.
-        length: Number of grid rows.
+        a: First of the other two factors in the order weights (b, m, tap), values (b, m, column),
+            grid (b, row, column), real.
+        b: Second of the other two factors.
 
     Returns:
-        Grid, shape (b, length, column).
+        The factor that is wanted, in its shape.
     """
-    return _Trilinear.apply("grid", length, first, weights, values)
-
-
-def interpolate_rows(weights: Tensor, grid: Tensor, first: Tensor) -> Tensor:
-    """Interpolate grid rows at points: sum weights[m, tap] * grid[first[m] + tap] over the taps.
-
-    For fixed weights this is the adjoint of `spread_rows` as a map from values to the grid.
-
-    Args:
-        weights: Tap weights, shape (b, m, tap), real.
-        grid: Grid, shape (b, row, column), real.
-        first: First grid row of each point, shape (b, m), int64.
-
-    Returns:
-        Values, shape (b, m, column).
-    """
-    return _Trilinear.apply("values", 0, first, weights, grid)
-
-
-def correlate_rows(values: Tensor, grid: Tensor, first: Tensor, taps: int) -> Tensor:
-    """Correlate values with grid rows: sum values[m] * grid[first[m] + tap] over the columns.
-
-    For fixed values this is the adjoint of `spread_rows` as a map from weights to the grid.
-
-    Args:
-        values: Rows of values, shape (b, m, column), real.
-        grid: Grid, shape (b, row, column), real.
-        first: First grid row of each point, shape (b, m), int64.
-        taps: Number of taps.
-
-    Returns:
-        Sums for each point and tap, shape (b, m, tap).
-    """
-    return _Trilinear.apply("weights", taps, first, values, grid)
+    return _Trilinear.apply(wanted, size, first, a, b)
 
 
 class _Trilinear(torch.autograd.Function):
@@ -104,10 +105,16 @@ class _Trilinear(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        first, a, b = ctx.saved_tensors
+        first, *factors = ctx.saved_tensors
         names = [part for part in _PARTS if part != ctx.wanted]
-        parts = dict(zip(names, (a, b))) | {ctx.wanted: gradient}
-        slopes = [_partial(name, parts, first) if ctx.needs_input_grad[3 + i] else None for i, name in enumerate(names)]
+        parts = dict(zip(names, factors)) | {ctx.wanted: gradient}
+        sizes = {"grid": parts["grid"].shape[-2], "weights": parts["weights"].shape[-1], "values": 0}
+        slopes = [
+            _Trilinear.apply(name, sizes[name], first, *(parts[part] for part in _PARTS if part != name))
+            if ctx.needs_input_grad[3 + i]
+            else None
+            for i, name in enumerate(names)
+        ]
         return None, None, None, *slopes
 
     @staticmethod
@@ -123,13 +130,6 @@ class _Trilinear(torch.autograd.Function):
     ) -> tuple[Tensor, int]:
         joined = [_in_front(x, dim, info.batch_size) for x, dim in zip((first, a, b), in_dims[2:])]
         return _Trilinear.apply(wanted, size, *joined).unflatten(0, (info.batch_size, -1)), 0
-
-
-def _partial(name: str, parts: dict[str, Tensor], first: Tensor) -> Tensor:
-    """Derivative of the form by the named factor, in the size of that factor."""
-    others = [parts[part] for part in _PARTS if part != name]
-    size = {"grid": parts["grid"].shape[-2], "weights": parts["weights"].shape[-1], "values": 0}[name]
-    return _Trilinear.apply(name, size, first, *others)
 
 
 def _in_front(x: Tensor, dim: int | None, count: int) -> Tensor:
@@ -244,7 +244,7 @@ class PulseNufft:
         scale: float = 1.0,
     ) -> None:
         self.lines, self.kernel, self.dtype = lines, kernel, dtype
-        self.length = smooth_length(max(math.ceil(kernel.oversampling * lines), 2 * kernel.taps))
+        self.length = kernel.grid_length(lines)
         line = torch.arange(lines, dtype=torch.float64, device=device) - lines // 2
         # the taps start at the row of their point instead of half a width before it, so that a
         # point on a row has its taps about the middle of the kernel for any width; the factor
@@ -273,16 +273,11 @@ class PulseNufft:
         position = (cycles_per_line - whole) * self.length
         first = torch.nan_to_num(torch.round(position.detach()), 0.0, 0.0, 0.0)
         weights = self.kernel.weights((position - first).to(real_dtype(self.dtype)))
-        return PulsePoints(first.to(torch.int64), weights.movedim(0, -1), self._reach(first))
-
-    def _reach(self, first: Tensor) -> int:
-        """Number of rows that the taps reach, so that rows beyond are not processed.
-
-        All rows inside vmap, where values cannot be read, and on an accelerator, where waiting for
-        them takes longer.
-        """
-        largest = self.length + 1
-        return (host_largest(first, largest) if first.device.type == "cpu" else largest) + self.kernel.taps
+        # rows beyond the last tap are not processed; all are inside vmap, where values cannot be
+        # read, and on an accelerator, where waiting for them takes longer
+        last = self.length + 1
+        last = host_largest(first, last) if first.device.type == "cpu" else last
+        return PulsePoints(first.to(torch.int64), weights.movedim(0, -1), last + self.kernel.taps)
 
     def type1(self, y: Tensor, points: PulsePoints) -> Tensor:
         """Sum pulses into image lines q: sum_m y[m] exp(+2j pi p[m] (q - lines // 2)).
@@ -298,10 +293,9 @@ class PulseNufft:
         """
         trials = np.broadcast_shapes(y.shape[:-2], points.first.shape[:-1])
         first, weights = _joined(points.first, trials, 1), _joined(points.weights, trials, 2)
-        grid = spread_rows(
-            weights, _joined(torch.view_as_real(y.resolve_conj()).flatten(-2), trials, 2), first, points.rows
-        )
-        image = _Lines.apply(torch.view_as_complex(grid.unflatten(-1, (-1, 2))), self._factor, self.length, 0)
+        values = _joined(torch.view_as_real(y.resolve_conj()).flatten(-2), trials, 2)
+        grid = torch.view_as_complex(trilinear("grid", points.rows, first, weights, values).unflatten(-1, (-1, 2)))
+        image = LinearMap.apply(grid, self._to_lines, partial(self._to_grid, points.rows))
         return image.view(*trials, *image.shape[-2:])
 
     def type2(self, x: Tensor, points: PulsePoints) -> Tensor:
@@ -318,46 +312,55 @@ class PulseNufft:
         """
         trials = np.broadcast_shapes(x.shape[:-2], points.first.shape[:-1])
         first, weights = _joined(points.first, trials, 1), _joined(points.weights, trials, 2)
-        grid = _Lines.apply(_joined(x, trials, 2), self._factor, self.length, points.rows)
-        rows = interpolate_rows(weights, torch.view_as_real(grid).flatten(-2), first).unflatten(-1, (-1, 2))
+        grid = LinearMap.apply(_joined(x, trials, 2), partial(self._to_grid, points.rows), self._to_lines)
+        rows = trilinear("values", 0, first, weights, torch.view_as_real(grid).flatten(-2)).unflatten(-1, (-1, 2))
         return torch.view_as_complex(rows).view(*trials, *rows.shape[-3:-1])
+
+    # the two transforms work on blocks of columns that fit the cache and are contiguous while they
+    # are transformed; lines have a strided range dimension
+
+    def _to_lines(self, grid: Tensor) -> Tensor:
+        """Inverse FFT of grid rows (b, row, range), cropped to the lines, times the factor."""
+        b, rows, columns = grid.shape
+        length, lines, half, inside = self.length, self.lines, self.lines // 2, min(rows, self.length)
+        out = grid.new_empty(b, columns, lines)
+
+        def work(part: tuple[slice, slice]) -> None:
+            block, target = grid[part[0], :, part[1]].mT, out[part]
+            padded = grid.new_empty(*block.shape[:2], length)
+            padded[..., :inside] = block[..., :inside]
+            padded[..., inside:] = 0
+            padded[..., : rows - inside] += block[..., inside:]  # periodic
+            whole = torch.fft.ifft(padded, norm="forward")
+            torch.mul(whole[..., length - half :], self._factor[:half], out=target[..., :half])
+            torch.mul(whole[..., : lines - half], self._factor[half:], out=target[..., half:])
+
+        over_blocks(work, _blocks(grid, length), out)
+        return out.mT
+
+    def _to_grid(self, rows: int, x: Tensor) -> Tensor:
+        """Adjoint of `_to_lines` onto some grid rows, (b, line, range) to (b, row, range)."""
+        b, lines, columns = x.shape
+        length, half, inside = self.length, lines // 2, min(rows, self.length)
+        conj, out = self._factor.conj().resolve_conj(), x.new_empty(b, rows, columns)
+
+        def work(part: tuple[slice, slice]) -> None:
+            block, target = x[part[0], :, part[1]].mT, out[part[0], :, part[1]].mT
+            padded = x.new_empty(*block.shape[:2], length)
+            padded[..., lines - half : length - half] = 0
+            torch.mul(block[..., :half], conj[:half], out=padded[..., length - half :])
+            torch.mul(block[..., half:], conj[half:], out=padded[..., : lines - half])
+            whole = torch.fft.fft(padded)
+            target[..., :inside] = whole[..., :inside]
+            target[..., inside:] = whole[..., : rows - inside]
+
+        over_blocks(work, _blocks(x, length), out)
+        return out
 
 
 def _joined(x: Tensor, trials: tuple[int, ...], trailing: int) -> Tensor:
     """x for all trials, with one leading dim."""
     return x.expand(*trials, *x.shape[x.ndim - trailing :]).reshape(-1, *x.shape[x.ndim - trailing :])
-
-
-class _Lines(torch.autograd.Function):
-    """Grid rows to lines, (b, row, range) to (b, line, range): inverse FFT along rows, crop,
-    factor; with rows > 0 its adjoint onto that number of rows. Works on blocks of columns that
-    fit the cache and are contiguous while they are transformed; lines have a strided range dim.
-    """
-
-    @staticmethod
-    def forward(x: Tensor, factor: Tensor, length: int, rows: int) -> Tensor:
-        return _lines_to_grid(x, factor, length, rows) if rows else _grid_to_lines(x, factor, length)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
-        x, factor, length, rows = inputs
-        ctx.length, ctx.rows, ctx.same = length, 0 if rows else x.shape[-2], rows
-        ctx.save_for_backward(factor)
-        ctx.save_for_forward(factor)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return _Lines.apply(gradient, *ctx.saved_tensors, ctx.length, ctx.rows), None, None, None
-
-    @staticmethod
-    def jvp(ctx: Any, tangent: Tensor, *_: None) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return _Lines.apply(tangent, *ctx.saved_tensors, ctx.length, ctx.same)
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple, x: Tensor, factor: Tensor, length: int, rows: int) -> tuple[Tensor, int]:
-        return _Lines.apply(_in_front(x, in_dims[0], info.batch_size), factor, length, rows).unflatten(
-            0, (info.batch_size, -1)
-        ), 0
 
 
 def _blocks(x: Tensor, length: int) -> list[tuple[slice, slice]]:
@@ -370,43 +373,3 @@ def _blocks(x: Tensor, length: int) -> list[tuple[slice, slice]]:
         height = room // columns
         return [(slice(at, at + height), slice(None)) for at in range(0, b, height)]
     return [(slice(trial, trial + 1), slice(at, at + room)) for trial in range(b) for at in range(0, columns, room)]
-
-
-def _grid_to_lines(grid: Tensor, factor: Tensor, length: int) -> Tensor:
-    """Inverse FFT of grid rows, cropped to the lines and multiplied by the factor."""
-    b, rows, columns = grid.shape
-    lines, half, inside = factor.shape[0], factor.shape[0] // 2, min(rows, length)
-    out = grid.new_empty(b, columns, lines)
-
-    def work(part: tuple[slice, slice]) -> None:
-        block, target = grid[part[0], :, part[1]].mT, out[part]
-        padded = grid.new_empty(*block.shape[:2], length)
-        padded[..., :inside] = block[..., :inside]
-        padded[..., inside:] = 0
-        padded[..., : rows - inside] += block[..., inside:]  # periodic
-        whole = torch.fft.ifft(padded, norm="forward")
-        torch.mul(whole[..., length - half :], factor[:half], out=target[..., :half])
-        torch.mul(whole[..., : lines - half], factor[half:], out=target[..., half:])
-
-    over_blocks(work, _blocks(grid, length), out)
-    return out.mT
-
-
-def _lines_to_grid(x: Tensor, factor: Tensor, length: int, rows: int) -> Tensor:
-    """Adjoint of `_grid_to_lines` onto `rows` grid rows."""
-    b, lines, columns = x.shape
-    half, inside, conj = lines // 2, min(rows, length), factor.conj().resolve_conj()
-    out = x.new_empty(b, rows, columns)
-
-    def work(part: tuple[slice, slice]) -> None:
-        block, target = x[part[0], :, part[1]].mT, out[part[0], :, part[1]].mT
-        padded = x.new_empty(*block.shape[:2], length)
-        padded[..., lines - half : length - half] = 0
-        torch.mul(block[..., :half], conj[:half], out=padded[..., length - half :])
-        torch.mul(block[..., half:], conj[half:], out=padded[..., : lines - half])
-        whole = torch.fft.fft(padded)
-        target[..., :inside] = whole[..., :inside]
-        target[..., inside:] = whole[..., : rows - inside]
-
-    over_blocks(work, _blocks(x, length), out)
-    return out

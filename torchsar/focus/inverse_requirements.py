@@ -10,21 +10,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
-from torchsar.focus.requirements import Requirement
+from torchsar.focus.requirements import Requirement, refuse_numbers
 from torchsar.radar import InverseRadar
-
-# rms shift of envelopes in range cells; measured on an aircraft scene: 0.05 cell costs 0.05 nat of
-# entropy, 0.1 cell 0.19 nat
-SHIFT_RMS_CELLS = 0.05
-# migration by rotation in range cells; measured on the same scene: 0.38 cell costs 0.02 nat, 0.75
-# cell 0.07 nat, 1.5 cells 0.2 nat
-MIGRATION_WARN_CELLS, MIGRATION_LIMIT_CELLS = 0.4, 1.0
-# remedies and consequences that several rows share
-_KEYSTONE = "resample slow time per range frequency (keystone)"
-_SMOOTH = "align envelopes pulse by pulse and smooth the shifts"
-_WRAP = "the edges of the target are aliased"
 
 
 def inverse_requirements(
@@ -82,222 +70,140 @@ def inverse_requirements(
             "rotation_rad_s is not given and radar.rotation_rad_s is not set; give one of them, since "
             "the requirements of a rotating target depend on its rotation"
         )
-    _check_finite(
-        {
-            "n_pulse": n_pulse,
-            "n_range": n_range,
-            "cross_range_extent_m": cross_range_extent_m,
-            "range_extent_m": range_extent_m,
-        },
-        least=1e-12,
+    refuse_numbers(
+        1e-12,
+        n_pulse=n_pulse,
+        n_range=n_range,
+        cross_range_extent_m=cross_range_extent_m,
+        range_extent_m=range_extent_m,
     )
-    _check_finite({"velocity_m_s": velocity_m_s, "acceleration_m_s2": acceleration_m_s2, "rotation_rad_s": omega})
+    refuse_numbers(-math.inf, velocity_m_s=velocity_m_s, acceleration_m_s2=acceleration_m_s2, rotation_rad_s=omega)
     for amplitude, frequency in vibrations:
-        _check_finite({"amplitude_m of a vibration": amplitude})
-        _check_finite({"frequency_hz of a vibration": frequency}, least=0)
-    target = TurningTarget(
-        radar,
-        n_pulse / radar.prf_hz,
-        cross_range_extent_m / 2,
-        range_extent_m / 2,
-        abs(omega),
-        abs(velocity_m_s),
-        abs(acceleration_m_s2),
-        tuple(vibrations),
+        refuse_numbers(-math.inf, **{"amplitude_m of a vibration": amplitude})
+        refuse_numbers(0, **{"frequency_hz of a vibration": frequency})
+    cross_m, range_m, cell_m = cross_range_extent_m / 2, range_extent_m / 2, radar.range_step_m
+    speed, push, per_m = abs(velocity_m_s), abs(acceleration_m_s2), 4 * math.pi / radar.wavelength_m
+    period_s = 1 / radar.prf_hz
+    aperture_s = n_pulse * period_s
+
+    def shift(effect: str, neglects: str, rms_cells: float, cells: float, remedy: str) -> Requirement:
+        """Row of a shift that changes from pulse to pulse, compared by its rms; a cell is a phase
+        of pi at the ends of the band. On an aircraft scene, shifts of 0.05 cell rms cost 0.05 nat
+        of entropy, those of 0.1 cell 0.19 nat.
+        """
+        return Requirement(effect, neglects, math.pi * rms_cells, cells, math.pi * 0.05, remedy)
+
+    # over the aperture: range migration and the nonlinear phase of rotation. The rms about the mean
+    # of a value that grows linearly by x is x / sqrt(12). On the same scene, a migration of 0.38
+    # cell costs 0.02 nat, one of 0.75 cell 0.07 nat, one of 1.5 cells 0.2 nat
+    angle, linear = abs(omega) * aperture_s, 1 / math.sqrt(12)
+    walk, travel = cross_m * angle / cell_m, speed * aperture_s * linear / cell_m
+    versed = per_m * range_m * (angle / 2) ** 2 / 2
+    resample = "resample slow time per range frequency (keystone)"
+    where = "" if walk > 1 else "warning: the edges blur, up to 0.1 nat of entropy; "
+    keystone = f"{where}{resample}{'' if walk > 1 else ' where that matters'}"
+    smooth = "align envelopes pulse by pulse and smooth the shifts"
+    # between neighbouring pulses and range frequencies, beyond pi steps alias
+    swing = sum(2 * abs(a) * math.sin(math.pi * min(f * period_s, 0.5)) for a, f in vibrations)
+    turned, extent = per_m * cross_m * abs(omega) * period_s, 2 * range_m / cell_m
+    aliased = "the edges of the target are aliased"
+    rows = (
+        Requirement(
+            "rotation migration ignored",
+            "range walk x omega T of the target's edges",
+            math.pi * walk,
+            walk,
+            math.pi * 0.4,
+            keystone,
+        ),
+        Requirement(
+            "phase linear in rotation",
+            "y (cos theta - 1) of near and far parts",
+            versed,
+            math.nan,
+            tolerance_rad,
+            "focus by polar format or backprojection",
+        ),
+        shift(
+            "envelopes not aligned",
+            "travel over the aperture (the cells: rms)",
+            travel,
+            travel,
+            f"track the target, then {smooth}",
+        ),
+        Requirement(
+            "vibration followed by pulses",
+            "phase between pulses",
+            per_m * swing,
+            math.nan,
+            math.pi,
+            "phases alias: estimate each pulse separately, without unwrapping",
+        ),
+        Requirement(
+            "cross range unambiguous",
+            "phase between pulses of the edges",
+            turned,
+            math.nan,
+            math.pi,
+            f"raise the pulse rate: {aliased}",
+        ),
+        Requirement(
+            "range unambiguous",
+            "extent over the window (the cells: extent)",
+            math.pi * extent / n_range,
+            extent,
+            math.pi,
+            f"take more range samples: {aliased}",
+        ),
     )
-    rows = target.over_aperture(tolerance_rad) + target.between_samples(n_range)
-    return rows if radar.pulse_s is None else rows + target.inside_pulses(radar.pulse_s, tolerance_rad)
-
-
-@dataclass(frozen=True)
-class TurningTarget:
-    """Rotating target with the radial motion that compensation leaves; all values are 0 or more.
-
-    Args:
-        radar: Radar of the recording.
-        aperture_s: Aperture time in seconds.
-        cross_m: Half extent in cross range, in metres.
-        range_m: Half extent in range, in metres.
-        rate_rad_s: Rotation rate in rad/s.
-        velocity_m_s: Remaining radial velocity in m/s.
-        acceleration_m_s2: Remaining radial acceleration in m/s^2.
-        vibrations: Amplitude in metres and frequency in Hz of each vibration.
-    """
-
-    radar: InverseRadar
-    aperture_s: float
-    cross_m: float
-    range_m: float
-    rate_rad_s: float
-    velocity_m_s: float
-    acceleration_m_s2: float
-    vibrations: tuple[tuple[float, float], ...]
-
-    def over_aperture(self, tolerance_rad: float) -> tuple[Requirement, ...]:
-        """List the errors over the aperture: range migration and the nonlinear phase of rotation.
-
-        Args:
-            tolerance_rad: Tolerated nonlinear phase in rad.
-
-        Returns:
-            One `Requirement` per simplification: what it neglects, the error and the remedy.
-        """
-        angle, cell = self.rate_rad_s * self.aperture_s, self.radar.range_step_m
-        cells = self.cross_m * angle / cell
-        travel = _rms_of_line(self.velocity_m_s * self.aperture_s) / cell
-        versed = 4 * math.pi / self.radar.wavelength_m * self.range_m * (angle / 2) ** 2 / 2
-        keystone = (
-            _KEYSTONE
-            if cells > MIGRATION_LIMIT_CELLS
-            else f"warning: the edges blur, up to 0.1 nat of entropy; {_KEYSTONE} where that matters"
-        )
-        return (
-            Requirement(
-                "rotation migration ignored",
-                "range walk x omega T of the target's edges",
-                math.pi * cells,
-                cells,
-                math.pi * MIGRATION_WARN_CELLS,
-                keystone,
-            ),
-            Requirement(
-                "phase linear in rotation",
-                "y (cos theta - 1) of near and far parts",
-                versed,
-                math.nan,
-                tolerance_rad,
-                "focus by polar format or backprojection",
-            ),
-            _shift(
-                "envelopes not aligned",
-                "travel over the aperture (the cells: rms)",
-                travel,
-                travel,
-                f"track the target, then {_SMOOTH}",
-            ),
-        )
-
-    def between_samples(self, n_range: int) -> tuple[Requirement, ...]:
-        """List the largest phase steps between neighbouring pulses and range frequencies.
-
-        The steps are due to vibration, to the rotation of the outermost scatterers in cross range,
-        and to the extent of the target in range. Steps beyond pi alias.
-
-        Args:
-            n_range: Number of range samples.
-
-        Returns:
-            One `Requirement` per simplification: what it neglects, the error and the remedy.
-        """
-        per_m, period_s = 4 * math.pi / self.radar.wavelength_m, 1 / self.radar.prf_hz
-        swing = sum(2 * abs(a) * math.sin(math.pi * min(f * period_s, 0.5)) for a, f in self.vibrations)
-        cells = 2 * self.range_m / self.radar.range_step_m
-        return (
-            Requirement(
-                "vibration followed by pulses",
-                "phase between pulses",
-                per_m * swing,
-                math.nan,
-                math.pi,
-                "phases alias: estimate each pulse separately, without unwrapping",
-            ),
-            Requirement(
-                "cross range unambiguous",
-                "phase between pulses of the edges",
-                per_m * self.cross_m * self.rate_rad_s * period_s,
-                math.nan,
-                math.pi,
-                f"raise the pulse rate: {_WRAP}",
-            ),
-            Requirement(
-                "range unambiguous",
-                "extent over the window (the cells: extent)",
-                math.pi * cells / n_range,
-                cells,
-                math.pi,
-                f"take more range samples: {_WRAP}",
-            ),
-        )
-
-    def inside_pulses(self, pulse_s: float, tolerance_rad: float) -> tuple[Requirement, ...]:
-        """List the effects of motion within a dechirped pulse.
-
-        Args:
-            pulse_s: Pulse length in seconds.
-            tolerance_rad: Tolerated phase in rad.
-
-        Returns:
-            One `Requirement` per simplification: what it neglects, the error and the remedy.
-        """
-        chirp, half2 = self.radar.chirp_rate_hz_s, pulse_s**2 / 4
-        coupling = self.radar.carrier_hz / chirp / self.radar.range_step_m  # cells per m/s
-        drift = _rms_of_line(self.acceleration_m_s2 * self.aperture_s) * coupling
-        shaken = sum(abs(a) * 2 * math.pi * f for a, f in self.vibrations) * coupling
-        inside = self.acceleration_m_s2 + sum(abs(a) * (2 * math.pi * f) ** 2 for a, f in self.vibrations)
-        walk = 2 * math.pi * chirp * 2 * half2 / self.radar.wave_speed_m_s  # rad per m/s
-        known = f"compress with the velocity, known to {tolerance_rad / walk:.3g} m/s"
-        bend = 2 * math.pi / self.radar.wavelength_m * inside * half2
-        video = math.pi * chirp * (2 * self.range_m / self.radar.wave_speed_m_s) ** 2
-        return (
-            _shift(
-                "range-Doppler coupling",
-                "change of v f0 / gamma over the aperture (the cells: the constant part)",
-                drift,
-                self.velocity_m_s * coupling,
-                _SMOOTH,
-            ),
-            Requirement(
-                "intra-pulse walk",
-                "blur by motion in a pulse",
-                walk * self.velocity_m_s,
-                4 * walk * self.velocity_m_s / math.pi,
-                tolerance_rad,
-                known,
-            ),
-            Requirement(
-                "intra-pulse acceleration",
-                "quadratic phase in a pulse",
-                bend,
-                math.nan,
-                tolerance_rad,
-                "shorten the pulse: a shift cannot correct it",
-            ),
-            _shift(
-                "vibration coupling",
-                "oscillating shift A w f0 / gamma (the cells: peak)",
-                shaken / math.sqrt(2),
-                shaken,
-                _SMOOTH,
-            ),
-            Requirement(
-                "residual video phase",
-                "pi gamma dtau^2 at the edges",
-                video,
-                math.nan,
-                tolerance_rad,
-                "remove it in compression (done by default)",
-            ),
-        )
-
-
-def _shift(effect: str, neglects: str, rms_cells: float, cells: float, remedy: str) -> Requirement:
-    """Row of a shift that changes from pulse to pulse, compared by its rms; a cell is a phase of pi
-    at the ends of the band.
-    """
-    return Requirement(effect, neglects, math.pi * rms_cells, cells, math.pi * SHIFT_RMS_CELLS, remedy)
-
-
-def _rms_of_line(whole: float) -> float:
-    """Rms about the mean of a value that grows linearly by `whole`."""
-    return whole / math.sqrt(12)
-
-
-def _check_finite(numbers: dict[str, float], least: float = -math.inf) -> None:
-    """Raise ValueError for numbers that are not finite or below `least`."""
-    for name, value in numbers.items():
-        if not (math.isfinite(value) and value >= least):
-            raise ValueError(
-                f"{name} must be a finite "
-                f"{'' if least == -math.inf else 'positive ' if least > 0 else 'non-negative '}number, "
-                f"got {value}"
-            )
+    if radar.pulse_s is None:
+        return rows
+    # motion within a dechirped pulse; a velocity moves a range by `coupling` cells per m/s
+    chirp, half2 = radar.chirp_rate_hz_s, radar.pulse_s**2 / 4
+    coupling = radar.carrier_hz / chirp / cell_m
+    drift = push * aperture_s * linear * coupling
+    shaken = sum(abs(a) * 2 * math.pi * f for a, f in vibrations) * coupling
+    inside = push + sum(abs(a) * (2 * math.pi * f) ** 2 for a, f in vibrations)
+    blur = 2 * math.pi * chirp * 2 * half2 / radar.wave_speed_m_s  # rad per m/s
+    video = math.pi * chirp * (2 * range_m / radar.wave_speed_m_s) ** 2
+    return (
+        *rows,
+        shift(
+            "range-Doppler coupling",
+            "change of v f0 / gamma over the aperture (the cells: the constant part)",
+            drift,
+            speed * coupling,
+            smooth,
+        ),
+        Requirement(
+            "intra-pulse walk",
+            "blur by motion in a pulse",
+            blur * speed,
+            4 * blur * speed / math.pi,
+            tolerance_rad,
+            f"compress with the velocity, known to {tolerance_rad / blur:.3g} m/s",
+        ),
+        Requirement(
+            "intra-pulse acceleration",
+            "quadratic phase in a pulse",
+            2 * math.pi / radar.wavelength_m * inside * half2,
+            math.nan,
+            tolerance_rad,
+            "shorten the pulse: a shift cannot correct it",
+        ),
+        shift(
+            "vibration coupling",
+            "oscillating shift A w f0 / gamma (the cells: peak)",
+            shaken / math.sqrt(2),
+            shaken,
+            smooth,
+        ),
+        Requirement(
+            "residual video phase",
+            "pi gamma dtau^2 at the edges",
+            video,
+            math.nan,
+            tolerance_rad,
+            "remove it in compression (done by default)",
+        ),
+    )

@@ -44,8 +44,8 @@ from torchsar.core import (
     unit_phasor,
 )
 from torchsar.focus.image_lines import CrossRangeLines, DopplerLines
-from torchsar.focus.transforms import Gridding, PulsesToLines, Transform
-from torchsar.focus.warped_sums import Sum, normalised_warp, slow_times
+from torchsar.focus.transforms import Gridding, Transform
+from torchsar.focus.warped_sums import PulsesToLines, Sum, normalised_warp, slow_times
 from torchsar.radar import InverseRadar
 from torchsar.radar.warp import least_rate, warp, warp_rate
 

@@ -44,9 +44,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
-from contextlib import suppress
-from dataclasses import dataclass
-from numbers import Real
 
 import numpy as np
 import torch
@@ -55,10 +52,12 @@ from torch.nn.functional import pad
 
 from torchsar.core import checked_samples, unit_phasor
 from torchsar.focus.backprojection import direct_sum, expanded_history
+from torchsar.focus.frame_geometry import BAND_EDGE
 from torchsar.focus.gridding import PulseNufft
 from torchsar.focus.image_grid import ImageGrid
 from torchsar.focus.nufft import Kernel, Nufft, Points, smooth_length
-from torchsar.focus.omega_k import BAND_EDGE, STATIONARY_TURNS, raised_cosine_band
+from torchsar.focus.omega_k import STATIONARY_TURNS
+from torchsar.focus.processed_beam import ProcessedBeam
 from torchsar.focus.stolt import omega_k_stolt
 from torchsar.radar import (
     LIGHT_M_S,
@@ -72,175 +71,11 @@ from torchsar.radar import (
 from torchsar.radar.antenna_path import refuse_unusable
 from torchsar.radar.spotlight import frequency_step_hz
 
-# nodes of the quadrature of the residual phase over angles, closest ranges and frequencies, and the
-# number of pulses, by choice
-_ANGLES, _RANGES, _FREQUENCIES, _PULSES = 24, 9, 5, 512
 # zero samples that are appended to the frequencies on each side, into which the spectrum of moved
-# envelopes may spread, found by trial
+# envelopes may spread, by choice
 _MARGIN = 16
-# relative error power that spreads beyond this margin is _LEAK / (_MARGIN * samples of a pulse),
-# measured for white noise
-_LEAK = 0.025
 # relative errors of interpolations by dtype, by choice
 _EPS = {torch.complex64: 1e-5, torch.complex128: 1e-11}
-# pixels that are interpolated at a time, by choice
-_PIXELS = 1 << 18
-# a path is too far from straight if compensation leaves a larger error than this, by choice: half
-# the amplitude
-_WORST_DB = -6.0
-
-
-@dataclass(frozen=True)
-class ProcessedBeam:
-    """Angles ahead of broadside that are processed, with raised-cosine edges.
-
-    Args:
-        width_deg: Width between half weights in degrees.
-        squint_deg: Angle of the middle ahead of broadside in degrees.
-
-    Raises:
-        ValueError: If a number is not finite, the width is not positive, or an edge lies 80 degrees
-            or more from broadside, or its slope as far as the track.
-    """
-
-    width_deg: float
-    squint_deg: float = 0.0
-
-    def __post_init__(self) -> None:
-        numbers = (self.width_deg, self.squint_deg)
-        if (
-            not all(isinstance(x, Real) for x in numbers)
-            or not (self.width_deg > 0 and abs(self.squint_deg) + self.width_deg / 2 < 80)
-            or abs(self.middle) + (1 + BAND_EDGE) * self.band / 2 >= 1
-        ):
-            raise ValueError(
-                "a processed beam needs a positive width_deg, edges less than 80 degrees from broadside, and slopes of "
-                "the edges that do not reach the track; a narrower one will do. Got "
-                f"width_deg={self.width_deg}, squint_deg={self.squint_deg}"
-            )
-
-    @property
-    def edges(self) -> tuple[float, float]:
-        """Sines of the angles at half weight."""
-        low, high = (math.sin(math.radians(self.squint_deg + side * self.width_deg / 2)) for side in (-1, 1))
-        return low, high
-
-    @property
-    def middle(self) -> float:
-        """Mean of the sines of both edges."""
-        return sum(self.edges) / 2
-
-    @property
-    def band(self) -> float:
-        """Difference of the sines of both edges."""
-        return self.edges[1] - self.edges[0]
-
-    @property
-    def steepest(self) -> float:
-        """Largest magnitude of the tangent of an angle with a weight."""
-        sine = abs(self.middle) + (1 + BAND_EDGE) * self.band / 2
-        return sine / math.sqrt(1 - sine**2)
-
-    @property
-    def mean_cosine(self) -> float:
-        """Mean of the cosine of the angle over the shares of `quadrature`."""
-        sine, share = self.quadrature()
-        return float((share * torch.sqrt(1 - sine.square())).sum())
-
-    def weight(self, sine: Tensor) -> Tensor:
-        """Return the weight of a line of sight, 0 to 1, in the shape of the argument.
-
-        Args:
-            sine: Sine of its angle ahead of broadside, any shape.
-        """
-        return raised_cosine_band((sine - self.middle) / self.band)
-
-    def lit_pulses(self, position_m: Tensor, points_m: Tensor) -> Tensor:
-        """Return the pulses that see points at an angle with a weight.
-
-        Angles are those from the straight track of the antenna (`StraightTrack`), in the plane of
-        the track and the point.
-
-        Args:
-            position_m: Positions of the antenna in metres, float64 (pulse, 3).
-            points_m: Points in metres, float64 (point, 3).
-
-        Returns:
-            First pulse that sees each point and the pulse after the last, int64 (point, 2); alike
-            where none sees it.
-
-        Raises:
-            TypeError: If the positions are not float64.
-            ValueError: If there are fewer than two positions, the antenna does not advance, or
-                values are not finite.
-        """
-        track = StraightTrack.fitted(position_m)
-        pulse, along = track.along_m(position_m), track.along_m(points_m)
-        closest = torch.linalg.vector_norm(track.across_m(points_m), dim=-1)
-        sines = (self.middle + side * (1 + BAND_EDGE) * self.band / 2 for side in (1, -1))
-        low, high = (along - closest * math.tan(math.asin(sine)) for sine in sines)
-        # an antenna that turns back may pass a coordinate several times
-        first = torch.searchsorted(pulse.cummax(0).values, low)
-        last = torch.searchsorted(pulse.flip(0).cummin(0).values.flip(0), high, right=True)
-        return torch.stack([first, torch.maximum(first, last)], -1)
-
-    def pulse_weights(self, position_m: Tensor, points_m: Tensor) -> Tensor:
-        """Return the weights with which pulses see points.
-
-        Angles are those of `lit_pulses`.
-
-        Args:
-            position_m: Positions of the antenna in metres, float64 (pulse, 3).
-            points_m: Points in metres, float64 (point, 3).
-
-        Returns:
-            Weights, 0 to 1, float64 (point, pulse).
-
-        Raises:
-            TypeError: If the positions are not float64.
-            ValueError: If there are fewer than two positions, the antenna does not advance, or
-                values are not finite.
-        """
-        track = StraightTrack.fitted(position_m)
-        ahead = track.along_m(points_m)[:, None] - track.along_m(position_m)
-        closest = torch.linalg.vector_norm(track.across_m(points_m), dim=-1)
-        return self.weight(ahead / torch.hypot(ahead, closest[:, None]))
-
-    def quadrature(self) -> tuple[Tensor, Tensor]:
-        """Return sines of angles, and their shares of the power of an image of white noise.
-
-        The share of a pulse is its squared weight. Pulses are even along the track, and have the
-        density (1 - s^2)^(-3/2) over the sine s.
-
-        Returns:
-            Sines and shares, whose sum is 1, float64 (angle,).
-        """
-        node, weight = _gauss(_ANGLES)
-        sine = self.middle + node * (1 + BAND_EDGE) * self.band / 2
-        share = weight * self.weight(sine).square() * (1 - sine.square()) ** -1.5
-        return sine, share / share.sum()
-
-
-def _gauss(n: int) -> tuple[Tensor, Tensor]:
-    """Nodes from -1 to 1 and weights of the Gauss-Legendre quadrature."""
-    node, weight = np.polynomial.legendre.leggauss(n)
-    return torch.from_numpy(node), torch.from_numpy(weight)
-
-
-def refuse_bistatic(antennas: AntennaPath) -> None:
-    """Raise an error unless one antenna transmits and receives.
-
-    Args:
-        antennas: Path of the antennas.
-
-    Raises:
-        ValueError: If there is a receiver of its own.
-    """
-    if antennas.receiver_m is not None:
-        raise ValueError(
-            "motion compensation refers to the straight track of one antenna, but this path is bistatic; image it by "
-            "tiles"
-        )
 
 
 class MotionCompensation:
@@ -269,7 +104,11 @@ class MotionCompensation:
         self, frequency_hz: Tensor, antennas: AntennaPath, grid: ImageGrid, beam: ProcessedBeam, order: int = 2
     ) -> None:
         refuse_unusable(frequency_hz=frequency_hz)
-        refuse_bistatic(antennas)
+        if antennas.receiver_m is not None:
+            raise ValueError(
+                "motion compensation refers to the straight track of one antenna, but this path is bistatic; image it "
+                "by tiles"
+            )
         if antennas.trials or order not in (1, 2):
             raise ValueError(
                 "motion compensation has the order 1 or 2 and takes one path without leading dimensions, got the order "
@@ -279,23 +118,8 @@ class MotionCompensation:
         self.frequency_hz, self.antennas, self.grid, self.beam, self.order = frequency_hz, antennas, grid, beam, order
         self.carrier_hz, self.sampling_hz = float(frequency_hz[n // 2]), n * step_hz
         self.track = StraightTrack.fitted(antennas.transmitter_m)
-        self._refuse_undersampled()
-        self._set_plane()
-        # the range to which all pulses refer
-        self.window_m = float(antennas.reference_m.mean()) / 2
-        middle = torch.full_like(self._pulse_m, sum(self._closest_m) / 2 / beam.mean_cosine)
-        self._first_m = self._correction_m(middle[:, None])[:, 0]
-        self._set_cells(step_hz)
-        left = self.predicted_db()
-        if left > _WORST_DB:
-            raise ValueError(
-                f"the path is too far from straight, {float(self._off_m.abs().max()):.3g} m at most: motion "
-                f"compensation would leave an image error of {left:.3g} dB; choose a narrower beam or image it by tiles"
-            )
-
-    def _refuse_undersampled(self) -> None:
-        """Raise ValueError unless pulses sample the processed beam at each frequency."""
-        beam, spread = self.beam, self.sampling_hz / self.carrier_hz
+        # pulses have to sample the processed beam at each frequency
+        spread = self.sampling_hz / self.carrier_hz
         band = beam.band * (1 + BAND_EDGE) * (1 + spread / 2) + abs(beam.middle) * spread
         needed, held = 2 * self.carrier_hz / LIGHT_M_S * band, 1 / self.track.step_m
         if needed > held:
@@ -304,12 +128,28 @@ class MotionCompensation:
                 f"beam of {beam.width_deg:g} degrees has {needed:.4g} with its edges; choose a narrower beam or image "
                 "it by tiles"
             )
+        sine, share = beam.quadrature()
+        self._cosine = float((share * torch.sqrt(1 - sine.square())).sum())
+        # largest magnitude of the tangent of an angle with a weight
+        steepest = math.tan(math.asin(max(map(abs, beam.ends))))
+        self._set_plane(steepest)
+        # the range to which all pulses refer
+        self.window_m = float(antennas.reference_m.mean()) / 2
+        middle = torch.full_like(self._pulse_m, sum(self._closest_m) / 2 / self._cosine)
+        self._first_m = self._correction_m(middle[:, None])[:, 0]
+        self._set_cells(step_hz, steepest)
+        left = self.predicted_db()
+        if left > -6:  # half the amplitude
+            raise ValueError(
+                f"the path is too far from straight, {float(self._off_m.abs().max()):.3g} m at most: motion "
+                f"compensation would leave an image error of {left:.3g} dB; choose a narrower beam or image it by tiles"
+            )
 
-    def _set_cells(self, step_hz: float) -> None:
+    def _set_cells(self, step_hz: float, steepest: float) -> None:
         """Choose the frequencies of the compensated data, beyond those of the history, and compute
         the ranges of the cells.
         """
-        n, beam = len(self.frequency_hz), self.beam
+        n = len(self.frequency_hz)
         window = LIGHT_M_S / (2 * step_hz)
         if not self.window_m > window / 2:
             raise ValueError(
@@ -319,16 +159,16 @@ class MotionCompensation:
         # omega-K lowers frequencies by their distance from the middle of the beam, and the second
         # order moves them by the slope of the correction; zeros make room for them, and for what
         # frequencies between two samples leak
-        lowered = 1 - math.cos(math.atan(beam.steepest) - math.asin(abs(beam.middle)))
+        lowered = 1 - math.cos(math.atan(steepest) - math.asin(abs(self.beam.middle)))
         ends = torch.tensor([self._closest_m], dtype=torch.float64, device=self._pulse_m.device)
-        change = self._correction_m(ends / beam.mean_cosine).diff(dim=-1)
+        change = self._correction_m(ends / self._cosine).diff(dim=-1)
         slope = float(change.abs().max()) / max(self._closest_m[1] - self._closest_m[0], window / n)
         self.cells = smooth_length(n + 2 * _MARGIN + math.ceil(2 * self.carrier_hz * (lowered + slope) / step_hz))
         cell = torch.arange(self.cells, dtype=torch.float64, device=self.frequency_hz.device) - self.cells // 2
         self.range_m = self.window_m + cell * (window / self.cells)
         self._all_hz = self.carrier_hz + cell * step_hz
 
-    def _set_plane(self) -> None:
+    def _set_plane(self, steepest: float) -> None:
         """Compute pulses and corners of the image in coordinates of the track."""
         grid, track = self.grid, self.track
         normal = torch.linalg.cross(grid.axes[0], grid.axes[1])
@@ -353,7 +193,7 @@ class MotionCompensation:
         self._pulse_m = track.along_m(place)
         # deviations of the pulses to the side of the image and up, (pulse, 2)
         self._off_m = track.across_m(place) @ torch.stack([side * torch.sign(off[0]), up / tilt], -1)
-        reach = self._closest_m[1] * self.beam.steepest
+        reach = self._closest_m[1] * steepest
         first = min(float(self._pulse_m.min()), float(along.min()) - reach)
         last = max(float(self._pulse_m.max()), float(along.max()) + reach)
         self.start_m, self.lines = first, smooth_length(math.ceil((last - first) / track.step_m) + 1)
@@ -373,7 +213,7 @@ class MotionCompensation:
         track, float64 (pulse, range).
         """
         along = self._pulse_m[:, None] + self.beam.middle * range_m
-        excess = self._excess(along, self.beam.mean_cosine * range_m, self._off_m[:, None])
+        excess = self._excess(along, self._cosine * range_m, self._off_m[:, None])
         return excess / (torch.sqrt((range_m.square() + excess).clamp_min(0)) + range_m)
 
     def predicted_db(self, pattern: Callable[[Tensor], Tensor] | None = None) -> float:
@@ -390,21 +230,25 @@ class MotionCompensation:
             change of the Fresnel ripple of the beam's edges over the swath; plus what leaks beyond
             the band.
         """
-        node, weight = (x.to(self._pulse_m.device) for x in _gauss(_RANGES))
-        low, high = self._closest_m
+        device, (low, high) = self._pulse_m.device, self._closest_m
+        node, weight = (torch.from_numpy(x).to(device) for x in np.polynomial.legendre.leggauss(9))
         closest = (low + high) / 2 + node * (high - low) / 2
         weight = weight * closest / (weight * closest).sum()
         # the ripple depends on the product of range and frequency
         spread = self.sampling_hz / self.carrier_hz / math.sqrt(12)
-        ripple = torch.stack([self._ripple_error(closest * (1 + sign * spread)) for sign in (-1, 1)]).mean(0)
+        used, ripple = self._filter((low + high) / 2), torch.zeros_like(closest)
+        for i, r in enumerate(closest.tolist()):
+            for exact in (self._filter(r * (1 + side * spread)) for side in (-1, 1)):
+                ripple[i] += (used - exact).abs().square().sum() / exact.abs().square().sum() / 2
         error = float((weight * (self._phase_error(closest, pattern) + ripple)).sum())
-        return 10 * math.log10(error + _LEAK / (_MARGIN * len(self.frequency_hz)))
+        # relative error power that spreads beyond the appended zeros, measured for white noise
+        return 10 * math.log10(error + 0.025 / (_MARGIN * len(self.frequency_hz)))
 
     def _phase_error(self, closest_m: Tensor, pattern: Callable[[Tensor], Tensor] | None) -> Tensor:
         """Mean of |exp(j phi) - 1|^2 at closest ranges, float64 (range,)."""
         sine, share = (x.to(closest_m.device) for x in self.beam.quadrature())
         share = share if pattern is None else share * pattern(sine)
-        some = slice(None, None, max(1, len(self._pulse_m) // _PULSES))
+        some = slice(None, None, max(1, len(self._pulse_m) // 512))
         # (pulse, range, angle)
         range_m = closest_m[:, None] / torch.sqrt(1 - sine.square())
         along = self._pulse_m[some, None, None] + range_m * sine
@@ -416,44 +260,10 @@ class MotionCompensation:
         both = self._correction_m(range_m.reshape(1, -1))[some].reshape(true.shape) if self.order == 2 else first
         wave = 4 * math.pi / LIGHT_M_S
         error = torch.zeros_like(true)
-        for offset, part in zip(*_gauss(_FREQUENCIES), strict=True):
-            phase = self.carrier_hz * (true - both) + offset * self.sampling_hz / 2 * (true - first)
-            error += part * (1 - torch.cos(wave * phase))
+        for offset, part in zip(*np.polynomial.legendre.leggauss(5), strict=True):
+            phase = self.carrier_hz * (true - both) + float(offset) * self.sampling_hz / 2 * (true - first)
+            error += float(part) * (1 - torch.cos(wave * phase))
         return (share * error).sum((0, 2)) / share.sum((0, 2)).clamp_min(1e-30)
-
-    def _ripple_error(self, closest_m: Tensor) -> Tensor:
-        """Relative square error of the spectrum along the track by the filter of the middle of the
-        swath, at closest ranges, float64 (range,).
-        """
-        used, *exact = (self._filter(float(r)) for r in (sum(self._closest_m) / 2, *closest_m))
-        return torch.stack([(used - one).abs().square().sum() / one.abs().square().sum() for one in exact])
-
-    def first_order(self, history: Tensor) -> Tensor:
-        """Move the echoes of each pulse so that the middle of the swath has its nominal range.
-
-        Phases then refer to the range `window_m` at all pulses.
-
-        Args:
-            history: Phase history, shape (..., pulse, frequency), complex.
-
-        Returns:
-            Phase history, same shape.
-        """
-        moved = 2 * (self._first_m + self.window_m) - self.antennas.reference_m
-        return history * unit_phasor(moved[:, None] * self.frequency_hz / LIGHT_M_S, history.dtype)
-
-    def second_order(self, profiles: Tensor) -> Tensor:
-        """Multiply each range cell by the phase that the first order leaves there.
-
-        Args:
-            profiles: Range profiles after the first order at `range_m`, shape (..., pulse, range),
-                complex.
-
-        Returns:
-            Range profiles, same shape.
-        """
-        left = self._correction_m(self.range_m[None]) - self._first_m[:, None]
-        return profiles * unit_phasor(2 * self.carrier_hz / LIGHT_M_S * left, profiles.dtype)
 
     def even_pulses(self, profiles: Tensor) -> Tensor:
         """Resample compensated pulses to even steps along the track, within the processed beam.
@@ -516,10 +326,17 @@ class MotionCompensation:
         Returns:
             Range profiles, shape (..., line, range), see `even_pulses`.
         """
+        # first order: the middle of the swath has its nominal range, and phases refer to the range
+        # `window_m` at all pulses
+        moved = 2 * (self._first_m + self.window_m) - self.antennas.reference_m
+        history = history * unit_phasor(moved[:, None] * self.frequency_hz / LIGHT_M_S, history.dtype)
         before = self.cells // 2 - history.shape[-1] // 2
-        after = self.cells - history.shape[-1] - before
-        profiles = range_profiles(pad(self.first_order(history), (before, after)))
-        return self.even_pulses(self.second_order(profiles) if self.order == 2 else profiles)
+        profiles = range_profiles(pad(history, (before, self.cells - history.shape[-1] - before)))
+        if self.order == 2:
+            # the phase that the first order leaves in each range cell
+            left = self._correction_m(self.range_m[None]) - self._first_m[:, None]
+            profiles = profiles * unit_phasor(2 * self.carrier_hz / LIGHT_M_S * left, profiles.dtype)
+        return self.even_pulses(profiles)
 
     def image(self, history: Tensor) -> Tensor:
         """Form the image by motion compensation and omega-K.
@@ -559,7 +376,7 @@ class MotionCompensation:
         spectrum = torch.fft.fft2(image).roll((lines // 2 - middle, n // 2), (-2, -1)) / (lines * n)
         grid = plans[0].grid(plans[1].grid(spectrum).mT)  # (..., range, line)
         made = []
-        for pixels in self.grid.pixels_m().reshape(-1, 3).split(_PIXELS):
+        for pixels in self.grid.pixels_m().reshape(-1, 3).split(1 << 18):
             closest = torch.linalg.vector_norm(self.track.across_m(pixels), dim=-1)
             slant = closest / cosine
             line = (self.track.along_m(pixels) - sine * slant - self.start_m) / step
@@ -591,27 +408,6 @@ class MotionCompensation:
             return self.antennas.path_m(pixels_m[pixels], pulses), weight
 
         return direct_sum(history, self.frequency_hz, path, len(pixels_m), eps=eps)
-
-
-def possible_compensations(
-    frequency_hz: Tensor, antennas: AntennaPath, grid: ImageGrid, beam: ProcessedBeam
-) -> dict[int, MotionCompensation]:
-    """Prepare motion compensation of those orders that a path allows.
-
-    Args:
-        frequency_hz: Frequencies in Hz, rising in equal steps, float64 (frequency,).
-        antennas: Path of the antennas, without leading dimensions.
-        grid: Pixels.
-        beam: Processed beam.
-
-    Returns:
-        Motion compensation by its order, 1 or 2, without those that `MotionCompensation` refuses.
-    """
-    found: dict[int, MotionCompensation] = {}
-    for order in (1, 2):
-        with suppress(ValueError):
-            found[order] = MotionCompensation(frequency_hz, antennas, grid, beam, order)
-    return found
 
 
 def compensated_omega_k(
@@ -648,7 +444,13 @@ def compensated_omega_k(
         ValueError: If shapes do not match, values are not finite, or a path does not suit, see
             `MotionCompensation`.
     """
-    antennas = AntennaPath(transmitter_m, None, reference_m)
+    return compensated_image(history, frequency_hz, AntennaPath(transmitter_m, None, reference_m), grid, beam, order)
+
+
+def compensated_image(
+    history: Tensor, frequency_hz: Tensor, antennas: AntennaPath, grid: ImageGrid, beam: ProcessedBeam, order: int
+) -> Tensor:
+    """Form the image of `compensated_omega_k` for a path of one antenna, see there."""
     history = checked_samples(history, "compensated_omega_k", "pulse, frequency", finite=False)
     history = expanded_history(history, antennas, frequency_hz, "compensated_omega_k")
     if not antennas.trials:

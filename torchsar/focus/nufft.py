@@ -23,11 +23,6 @@ from torch.nn.functional import pad
 
 from torchsar.core import checked_samples, host_largest, real_dtype
 
-# fineness of the FFT grid relative to the samples, the usual choice in gridding
-OVERSAMPLING = 2
-# chosen: largest shift in grid steps for which float32 keeps the error of a transform below -90 dB
-_SINGLE = 100.0
-
 
 @dataclass(frozen=True)
 class Kernel:
@@ -45,7 +40,7 @@ class Kernel:
     """
 
     taps: int
-    oversampling: float = OVERSAMPLING
+    oversampling: float = 2
 
     def __post_init__(self) -> None:
         if not (isinstance(self.taps, int) and 2 <= self.taps <= 16):
@@ -56,7 +51,7 @@ class Kernel:
             )
 
     @staticmethod
-    def of(eps: float, oversampling: float = OVERSAMPLING, even: bool = False) -> Kernel:
+    def of(eps: float, oversampling: float = 2, even: bool = False) -> Kernel:
         """Choose the narrowest kernel whose relative error stays below eps.
 
         Args:
@@ -91,6 +86,14 @@ class Kernel:
         """
         free = 1 - 1 / self.oversampling
         return max(8 * free * math.sqrt(self.taps) * math.exp(-math.pi * self.taps * math.sqrt(free)), 3e-14)
+
+    def grid_length(self, n: int) -> int:
+        """Return the length of the oversampled FFT grid of n samples.
+
+        Args:
+            n: Number of samples.
+        """
+        return smooth_length(max(math.ceil(self.oversampling * n), 2 * self.taps))
 
     @property
     def shape(self) -> float:
@@ -174,12 +177,16 @@ class Points:
                 for all trials or (..., m).
             length: Length of the grid.
             dtype: Real type of the weights.
-            shift: Offsets added to `start`, in grid steps, shape (..., m). They may be float32 if
-                they are small enough for its precision.
+            shift: Offsets added to `start`, in grid steps, shape (..., m). Those in float64 are
+                rounded to `dtype` where they are small enough for its precision.
 
         Returns:
             Points for `interpolate` and `spread`.
         """
+        if shift is not None and shift.dtype != dtype:
+            # up to 100 grid steps, float32 keeps the error of a transform below -90 dB
+            small = host_largest(shift.detach().abs(), math.inf) < 100
+            start, shift = (start, shift.to(dtype)) if small else (start + shift, None)
         start = start - (kernel.taps - 1) / 2
         whole = torch.round(start.detach())
         rest = (start - whole).to(dtype)
@@ -188,24 +195,6 @@ class Points:
         further = torch.round(rest.detach())
         first = torch.remainder(whole.to(torch.int64) + further.to(torch.int64), length)
         return Points(first, kernel.weights(rest - further))
-
-    @staticmethod
-    def near(kernel: Kernel, start: Tensor, length: int, dtype: torch.dtype, shift: Tensor) -> Points:
-        """Compute grid indices and kernel weights like `of`, in the precision that the shift needs.
-
-        Args:
-            kernel: Interpolation kernel.
-            start: Positions in grid steps, float64, shape (m,) for all trials or (..., m).
-            length: Length of the grid.
-            dtype: Real type of the weights.
-            shift: Offsets added to `start`, in grid steps, float64, shape (..., m).
-
-        Returns:
-            Points for `interpolate` and `spread`.
-        """
-        if host_largest(shift.detach().abs(), math.inf) < _SINGLE:
-            return Points.of(kernel, start, length, dtype, shift.to(dtype))
-        return Points.of(kernel, start + shift, length, dtype)
 
 
 def interpolate(grid: Tensor, points: Points) -> Tensor:
@@ -277,7 +266,7 @@ class Nufft:
 
     def __init__(self, n: int, eps: float, dtype: torch.dtype, device: torch.device | str | None = None) -> None:
         self.n, self.dtype, self.kernel = n, dtype, Kernel.of(eps)
-        self.length = smooth_length(max(OVERSAMPLING * n, 2 * self.kernel.taps))
+        self.length = self.kernel.grid_length(n)
         offset = torch.arange(n, dtype=torch.float64, device=device) - n // 2
         self.weight = (1 / self.kernel.spectrum(offset / self.length)).to(real_dtype(dtype))
 
@@ -290,7 +279,14 @@ class Nufft:
 
         Returns:
             Points for `type1` and `type2`.
+
+        Raises:
+            TypeError: If the frequencies are not float64.
         """
+        if cycles_per_sample.dtype != torch.float64:
+            raise TypeError(
+                f"points of a non-uniform FFT must be float64 cycles per sample, got {cycles_per_sample.dtype}"
+            )
         return Points.of(self.kernel, cycles_per_sample * self.length, self.length, real_dtype(self.dtype))
 
     def grid(self, x: Tensor) -> Tensor:
@@ -302,10 +298,7 @@ class Nufft:
         Returns:
             Spectrum, shape (..., length).
         """
-        x = x * self.weight
-        half = self.n // 2
-        gap = x.new_zeros((*x.shape[:-1], self.length - self.n))
-        return torch.fft.fft(torch.cat([x[..., half:], gap, x[..., :half]], -1))
+        return torch.fft.fft(embedded(x * self.weight, self.length))
 
     def type2(self, x: Tensor, points: Points) -> Tensor:
         """Evaluate the spectrum of samples at points p: sum_j x_j exp(-2j pi p (j - n//2)).
@@ -329,9 +322,38 @@ class Nufft:
         Returns:
             Samples x_j, j = 0..n-1, shape (..., n).
         """
-        x = torch.fft.ifft(spread(y, points, self.length), norm="forward")
-        half = self.n // 2
-        return torch.cat([x[..., self.length - half :], x[..., : self.n - half]], -1) * self.weight
+        return cropped(torch.fft.ifft(spread(y, points, self.length), norm="forward"), self.n) * self.weight
+
+
+def embedded(x: Tensor, length: int, dim: int = -1) -> Tensor:
+    """Embed centred samples in a longer circular array: sample n // 2 comes first.
+
+    Args:
+        x: Samples, n along `dim`.
+        length: Length of the array.
+        dim: Dimension of the samples.
+
+    Returns:
+        Array, `length` along `dim`.
+    """
+    n, shape = x.shape[dim], list(x.shape)
+    shape[dim] = length - n
+    return torch.cat([x.narrow(dim, n // 2, n - n // 2), x.new_zeros(shape), x.narrow(dim, 0, n // 2)], dim)
+
+
+def cropped(x: Tensor, n: int, dim: int = -1) -> Tensor:
+    """Cut n centred samples from a circular array, the adjoint of `embedded`.
+
+    Args:
+        x: Array whose first sample is the middle of the result.
+        n: Number of samples.
+        dim: Dimension of the samples.
+
+    Returns:
+        Samples, n along `dim`.
+    """
+    half = n // 2
+    return torch.cat([x.narrow(dim, x.shape[dim] - half, half), x.narrow(dim, 0, n - half)], dim)
 
 
 def nufft_type2(x: Tensor, points: Tensor, eps: float = 1e-6) -> Tensor:
@@ -354,7 +376,7 @@ def nufft_type2(x: Tensor, points: Tensor, eps: float = 1e-6) -> Tensor:
     """
     x = checked_samples(x, "nufft_type2", "mode", finite=False)
     plan = Nufft(x.shape[-1], eps, x.dtype, x.device)
-    return plan.type2(x, plan.points(_as_points(points)))
+    return plan.type2(x, plan.points(points))
 
 
 def nufft_type1(y: Tensor, points: Tensor, n: int, eps: float = 1e-6) -> Tensor:
@@ -378,14 +400,7 @@ def nufft_type1(y: Tensor, points: Tensor, n: int, eps: float = 1e-6) -> Tensor:
     """
     y = checked_samples(y, "nufft_type1", "point", finite=False)
     plan = Nufft(n, eps, y.dtype, y.device)
-    return plan.type1(y, plan.points(_as_points(points)))
-
-
-def _as_points(points: Tensor) -> Tensor:
-    """The points; raises TypeError unless float64."""
-    if points.dtype != torch.float64:
-        raise TypeError(f"points of a non-uniform FFT must be float64 cycles per sample, got {points.dtype}")
-    return points
+    return plan.type1(y, plan.points(points))
 
 
 def smooth_length(n: int) -> int:
@@ -403,11 +418,5 @@ def smooth_length(n: int) -> int:
     if n < 1:
         raise ValueError(f"an FFT has at least one sample, got the length {n}")
 
-    def is_smooth(k: int) -> bool:
-        """Whether k has no prime factor above 5."""
-        for p in (2, 3, 5):
-            while k % p == 0:
-                k //= p
-        return k == 1
-
-    return next(k for k in range(n, 2 * n + 1) if is_smooth(k))
+    # k has no prime factor above 5 if it divides a power of 30 that is high enough
+    return next(k for k in range(n, 2 * n + 1) if pow(30, k.bit_length(), k) == 0)

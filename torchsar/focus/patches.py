@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -18,29 +19,22 @@ from torchsar.radar import StripmapRadar
 HALF = 16
 
 
-@dataclass(frozen=True)
-class SmoothBand:
-    """Doppler band with raised-cosine edges over its outer eighths, as weight of the pulses.
+def smooth_band(width_hz: float, since_s: Tensor, offset_hz: Tensor) -> Tensor:
+    """Weight pulses by a Doppler band with raised-cosine edges over its outer eighths.
 
     Sharp edges would add Fresnel ripple to an image that serves as reference. Pulses in the inner
     three quarters of the band have the weight 1.
 
     Args:
         width_hz: Width of the band in Hz.
+        since_s: Not used.
+        offset_hz: Doppler of the pixel relative to the centroid, in Hz.
+
+    Returns:
+        Weights, shape of `offset_hz`.
     """
-
-    width_hz: float
-
-    def weight(self, since_s: Tensor, doppler_offset_hz: Tensor) -> Tensor:
-        """Return the weight of each pulse at each pixel, in the shape of `doppler_offset_hz`.
-
-        Args:
-            since_s: Slow time in seconds since the line of sight that defines the image
-                coordinates crossed the pixel; not used.
-            doppler_offset_hz: Doppler of the pixel relative to the centroid, in Hz.
-        """
-        outer = ((doppler_offset_hz.abs() - 3 * self.width_hz / 8) / (self.width_hz / 8)).clamp(0, 1)
-        return 0.5 * (1 + torch.cos(math.pi * outer))
+    outer = ((offset_hz.abs() - 3 * width_hz / 8) / (width_hz / 8)).clamp(0, 1)
+    return 0.5 * (1 + torch.cos(math.pi * outer))
 
 
 @dataclass(frozen=True)
@@ -117,7 +111,7 @@ class PointPatches:
         Returns:
             Patches, complex128, shape (patch, line, cell).
         """
-        band, parts = SmoothBand(self.radar.prf_hz), []
+        band, parts = partial(smooth_band, self.radar.prf_hz), []
         for spot in self.spots:
             lines, cells = ((i - HALF, i + HALF) for i in spot)
             stage = Backproject(

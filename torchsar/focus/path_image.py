@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from functools import partial
 from numbers import Real
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,11 +15,12 @@ from torch import Tensor
 from torchsar.core import Axis, Signal, Stage, real_dtype, untraced
 from torchsar.focus.backprojection import backproject
 from torchsar.focus.image_grid import ImageGrid, level_plane
-from torchsar.focus.ladar_requirements import Limit
-from torchsar.focus.motion_compensation import ProcessedBeam, compensated_omega_k, refuse_bistatic
+from torchsar.focus.motion_compensation import compensated_image
+from torchsar.focus.processed_beam import ProcessedBeam
+from torchsar.focus.requirements import Limit
 from torchsar.focus.spotlight import window_weights
 from torchsar.focus.tiles import TilePlan
-from torchsar.focus.tiles.choice import Lit, Weight
+from torchsar.focus.tiles.scene import Lit, Weight
 from torchsar.radar.antenna_path import AntennaPath
 from torchsar.radar.spotlight import frequency_samples
 from torchsar.radar.stripmap import LIGHT_M_S
@@ -282,6 +285,24 @@ def seen_in(stages: Iterable[object], antennas: AntennaPath) -> Tensor:
     return image.seen(antennas)
 
 
+def possible_plans(plan: Callable[[Any], Any], settings: Iterable[Any]) -> dict[Any, Any]:
+    """Plan the images of a geometry with several settings, such as errors of tiles.
+
+    Args:
+        plan: Function of a setting that returns the plan, or raises ValueError if the geometry does
+            not allow it.
+        settings: Settings.
+
+    Returns:
+        Plans by the settings that the geometry allows.
+    """
+    found: dict[Any, Any] = {}
+    for one in settings:
+        with suppress(ValueError):
+            found[one] = plan(one)
+    return found
+
+
 def last_image(stages: Iterable[object]) -> PathImage | None:
     """Find the last stage that images a path.
 
@@ -429,7 +450,5 @@ class OmegaKImage(PathImage):
         Raises:
             ValueError: If the path is bistatic or does not suit, see `MotionCompensation`.
         """
-        refuse_bistatic(antennas)
-        places = antennas.transmitter_m, antennas.reference_m
         assert self.beam is not None
-        return compensated_omega_k(history, frequency_hz, *places, grid, self.beam, self.order)
+        return compensated_image(history, frequency_hz, antennas, grid, self.beam, self.order)

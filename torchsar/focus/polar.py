@@ -18,13 +18,13 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchsar.core import Axis, block_bytes_of, real_dtype, unit_phasor
-from torchsar.focus.nufft import OVERSAMPLING, Kernel, Points, smooth_length
+from torchsar.focus.gridding import LinearMap
+from torchsar.focus.nufft import Nufft, cropped, embedded
 from torchsar.focus.spotlight import GroundImager, aperture_weights, refuse_other_size
 from torchsar.radar.spotlight import FarField, Spotlight, frequency_samples, range_profiles
 
@@ -45,118 +45,39 @@ class SparseRows:
     weights: Tensor
     size: tuple[int, int]
 
-    def __matmul__(self, x: Tensor) -> Tensor:
+    def __call__(self, x: Tensor) -> Tensor:
+        """Multiply the matrix with complex vectors (trial, columns), giving (trial, rows).
+
+        Real and imaginary parts of all trials are the columns of one product.
+        """
+        vectors = torch.view_as_real(x.resolve_conj()).movedim(0, 1)
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")
             matrix = torch.sparse_csr_tensor(self.starts, self.columns, self.weights, self.size, check_invariants=False)
-        return matrix @ x
+        product = (matrix @ vectors.flatten(1)).view(self.size[0], -1, 2)
+        return torch.view_as_complex(product.movedim(1, 0).contiguous())
 
 
-@dataclass(frozen=True, eq=False)
-class SparsePair:
-    """A real sparse matrix and its transpose.
+def sparse_pair(row: Tensor, weight: Tensor, rows: int) -> tuple[SparseRows, SparseRows]:
+    """Build a sparse matrix and its transpose from the entries of each column of the matrix.
 
     Args:
-        matrix: The matrix.
-        transpose: Its transpose.
+        row: Row of each entry, shape (column, entry), int64.
+        weight: Value of each entry, shape (column, entry), real.
+        rows: Number of rows of the matrix.
+
+    Returns:
+        The matrix and its transpose.
     """
-
-    matrix: SparseRows
-    transpose: SparseRows
-
-    @staticmethod
-    def of_columns(row: Tensor, weight: Tensor, rows: int) -> SparsePair:
-        """Build a sparse matrix and its transpose from the entries of each column of the matrix.
-
-        Args:
-            row: Row of each entry, shape (column, entry), int64.
-            weight: Value of each entry, shape (column, entry), real.
-            rows: Number of rows of the matrix.
-
-        Returns:
-            The matrix and its transpose.
-        """
-        columns, entries = row.shape
-        kind = torch.int32 if max(row.numel(), rows) < 2**31 else torch.int64
-        order = torch.argsort(row.reshape(-1).to(kind), stable=True)
-        starts = torch.cat([row.new_zeros(1), torch.bincount(row.reshape(-1), minlength=rows).cumsum(0)])
-        every = entries * torch.arange(columns + 1, device=row.device)
-        matrix = SparseRows(starts.to(kind), (order // entries).to(kind), weight.reshape(-1)[order], (rows, columns))
-        return SparsePair(
-            matrix, SparseRows(every.to(kind), row.reshape(-1).to(kind), weight.reshape(-1), (columns, rows))
-        )
-
-    def flipped(self) -> SparsePair:
-        """Return the pair with matrix and transpose exchanged."""
-        return SparsePair(self.transpose, self.matrix)
-
-    def __call__(self, x: Tensor) -> Tensor:
-        """Multiply the matrix with complex vectors (..., columns), giving (..., rows);
-        differentiable in x.
-        """
-        return _Apply.apply(x, self)
-
-
-class _Apply(torch.autograd.Function):
-    """Product of a sparse matrix with complex vectors; real and imaginary parts of all trials are
-    the columns of one product.
-    """
-
-    @staticmethod
-    def forward(x: Tensor, pair: SparsePair) -> Tensor:
-        vectors = torch.view_as_real(x.reshape(-1, x.shape[-1]).resolve_conj())
-        rows, (count, columns, _) = pair.matrix.size[0], vectors.shape
-        product = pair.matrix @ vectors.movedim(0, 1).reshape(columns, 2 * count)
-        out = product.view(rows, count, 2).movedim(1, 0).contiguous()
-        return torch.view_as_complex(out).view(*x.shape[:-1], rows)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
-        ctx.pair = inputs[1]
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return _Apply.apply(gradient, ctx.pair.flipped()), None
-
-    @staticmethod
-    def jvp(ctx: Any, tangent: Tensor, _: None) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return _Apply.apply(tangent, ctx.pair)
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple, x: Tensor, pair: SparsePair) -> tuple[Tensor, int]:
-        return _Apply.apply(x.movedim(in_dims[0], 0), pair), 0
-
-
-class _GridAxis:
-    """One image axis: positions of wave numbers on its oversampled grid, and the crop and division
-    that undo the oversampling.
-    """
-
-    def __init__(self, axis: Axis, kernel: Kernel, dtype: torch.dtype, device: torch.device) -> None:
-        self.n, self.kernel, self.step_m, self.dtype = axis.n, kernel, axis.step, dtype
-        self.centre_m = axis.start + (axis.n // 2) * axis.step
-        self.length = smooth_length(max(OVERSAMPLING * axis.n, 2 * kernel.taps))
-        offset = torch.arange(axis.n, dtype=torch.float64, device=device) - axis.n // 2
-        self.weight = (1 / kernel.spectrum(offset / self.length)).to(dtype)
-
-    def taps(self, cycles_m: Tensor) -> tuple[Tensor, Tensor]:
-        """Grid index and weight of every tap of every wave number (sample,), both (sample, tap)."""
-        points = Points.of(self.kernel, cycles_m * (self.step_m * self.length), self.length, self.dtype)
-        tap = torch.arange(self.kernel.taps, device=cycles_m.device)
-        return (points.first[:, None] + tap) % self.length, points.weights.T
-
-    def crop(self, grid: Tensor, dim: int) -> Tensor:
-        """The image part of the grid along dim."""
-        half = self.n // 2
-        return torch.cat([grid.narrow(dim, self.length - half, half), grid.narrow(dim, 0, self.n - half)], dim)
-
-    def embed(self, image: Tensor, dim: int) -> Tensor:
-        """Adjoint of crop."""
-        half, shape = self.n // 2, list(image.shape)
-        shape[dim] = self.length - self.n
-        return torch.cat(
-            [image.narrow(dim, half, self.n - half), image.new_zeros(shape), image.narrow(dim, 0, half)], dim
-        )
+    columns, entries = row.shape
+    kind = torch.int32 if max(row.numel(), rows) < 2**31 else torch.int64
+    flat = row.reshape(-1)
+    order = torch.argsort(flat.to(kind), stable=True)
+    starts = torch.cat([row.new_zeros(1), torch.bincount(flat, minlength=rows).cumsum(0)])
+    every = entries * torch.arange(columns + 1, device=row.device)
+    values = weight.reshape(-1)
+    matrix = SparseRows(starts.to(kind), (order // entries).to(kind), values[order], (rows, columns))
+    return matrix, SparseRows(every.to(kind), flat.to(kind), values, (columns, rows))
 
 
 class PolarOperator:
@@ -192,23 +113,20 @@ class PolarOperator:
     ) -> None:
         self.geometry, self.azimuth, self.range, self.dtype = geometry, azimuth, range_, dtype
         device, real = geometry.direction.device, real_dtype(dtype)
-        self._y, self._x = (_GridAxis(axis, Kernel.of(eps), real, device) for axis in (azimuth, range_))
+        self._y, self._x = (Nufft(axis.n, eps, dtype, device) for axis in (azimuth, range_))
         wave_number = 2 / geometry.wave_speed_m_s * geometry.frequency_hz  # cycles per metre
-        self._spread = self._layout(geometry.direction[:, :, None] * wave_number)
-        centre = (
-            geometry.direction @ geometry.direction.new_tensor([self._x.centre_m, self._y.centre_m]) + geometry.offset_m
+        cycles = (geometry.direction[:, :, None] * wave_number).unbind(1)
+        (column, across), (row, down) = (
+            _taps(plan, of.reshape(-1) * axis.step)
+            for plan, of, axis in zip((self._x, self._y), cycles, (range_, azimuth), strict=True)
         )
+        cell = row[:, :, None] * self._x.length + column[:, None, :]
+        weight = down[:, :, None] * across[:, None, :]
+        self._spread = sparse_pair(cell.flatten(1), weight.flatten(1), self._y.length * self._x.length)
+        middle = [axis.start + (axis.n // 2) * axis.step for axis in (range_, azimuth)]
+        centre = geometry.direction @ geometry.direction.new_tensor(middle) + geometry.offset_m
         self._factor = aperture_weights(window, geometry).to(real) * unit_phasor(centre[:, None] * wave_number, dtype)
         self._unkernel = self._y.weight[:, None] * self._x.weight
-
-    def _layout(self, cycles_m: Tensor) -> SparsePair:
-        """Sparse matrix from samples (pulse, 2, frequency) onto the flattened grid."""
-        column, across = self._x.taps(cycles_m[:, 0].reshape(-1))
-        row, down = self._y.taps(cycles_m[:, 1].reshape(-1))
-        cell = row[:, :, None] * self._x.length + column[:, None, :]
-        return SparsePair.of_columns(
-            cell.flatten(1), (down[:, :, None] * across[:, None, :]).flatten(1), self._y.length * self._x.length
-        )
 
     def image(self, profiles: Tensor) -> Tensor:
         """Form the polar-format image of range profiles.
@@ -230,9 +148,9 @@ class PolarOperator:
     def _image(self, profiles: Tensor) -> Tensor:
         """The image of one block of trials."""
         samples = frequency_samples(profiles) * self._factor
-        grid = self._spread(samples.flatten(-2)).unflatten(-1, (self._y.length, self._x.length))
-        columns = self._y.crop(torch.fft.ifft(grid, dim=-2, norm="forward"), -2)
-        return self._x.crop(torch.fft.ifft(columns, norm="forward"), -1) * self._unkernel
+        grid = LinearMap.apply(samples.flatten(-2), *self._spread).unflatten(-1, (self._y.length, self._x.length))
+        columns = cropped(torch.fft.ifft(grid, dim=-2, norm="forward"), self._y.n, -2)
+        return cropped(torch.fft.ifft(columns, norm="forward"), self._x.n) * self._unkernel
 
     def adjoint(self, image: Tensor) -> Tensor:
         """Map an image to range profiles by the adjoint of `image`.
@@ -258,9 +176,9 @@ class PolarOperator:
 
     def _adjoint(self, image: Tensor) -> Tensor:
         """The adjoint of one block of trials."""
-        columns = torch.fft.fft(self._x.embed(image * self._unkernel, -1))
-        grid = torch.fft.fft(self._y.embed(columns, -2), dim=-2)
-        samples = self._spread.flipped()(grid.flatten(-2)).unflatten(-1, self._factor.shape)
+        columns = torch.fft.fft(embedded(image * self._unkernel, self._x.length))
+        grid = torch.fft.fft(embedded(columns, self._y.length, -2), dim=-2)
+        samples = LinearMap.apply(grid.flatten(-2), *self._spread[::-1]).unflatten(-1, self._factor.shape)
         return range_profiles(samples * self._factor.conj())
 
     def _by_trials(self, work: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
@@ -323,6 +241,13 @@ class PolarFormat(GroundImager):
             Image, shape (..., azimuth, range).
         """
         return self.operator(profiles, geometry).image(profiles)
+
+
+def _taps(plan: Nufft, cycles: Tensor) -> tuple[Tensor, Tensor]:
+    """Grid index and weight of all taps of wave numbers in cycles per pixel, (sample, tap)."""
+    points = plan.points(cycles)
+    tap = torch.arange(plan.kernel.taps, device=cycles.device)
+    return (points.first[:, None] + tap) % plan.length, points.weights.T
 
 
 def _same(kept: list[Tensor], now: list[Tensor]) -> bool:

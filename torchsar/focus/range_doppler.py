@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from torchsar.core import checked_samples, linear_phasor, real_dtype, unit_phasor
+from torchsar.focus.frame_geometry import FrameGeometry
 from torchsar.focus.nufft import Nufft, Points
-from torchsar.focus.omega_k import STATIONARY_TURNS, Focuser, FrameGeometry, refocus_turns_per_sample, through_doppler
+from torchsar.focus.omega_k import STATIONARY_TURNS, Focuser, refocus_turns_per_sample, through_doppler
 from torchsar.radar import StripmapRadar
 
 
@@ -89,7 +90,7 @@ def range_doppler(
         # +2j pi k q / n, so that points have the opposite sign
         start = migration(at) * centre_cells
         shift = start[..., None] + migration(at)[..., None] * (range_cells - centre_cells)
-        points = Points.near(plan.kernel, -per_sample * cell, plan.length, real, -per_sample * shift)
+        points = Points.of(plan.kernel, -per_sample * cell, plan.length, real, -per_sample * shift)
         turns = refocus_turns_per_sample(at)
         constant = unit_phasor(turns * centre_cells + STATIONARY_TURNS, raw.dtype) / n
         lines = plan.type2(torch.fft.fftshift(spectrum, dim=-1), points)

@@ -13,28 +13,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.focus.ladar_requirements import Limit, Verdict
 from torchsar.focus.matched_fourier import MIN_PULSES
-from torchsar.focus.requirements import Requirement, phase_error_db
+from torchsar.focus.requirements import Limit, Requirement, phase_error_db
 from torchsar.radar import InverseRadar
 from torchsar.radar.warp import least_rate, warp, warp_rate
 
-# chosen limits of estimating the rotation rate: phase of the range term (rad), Cramer-Rao bound
-# (%), and rms share of the ranges that no line through the centre explains
-VISIBLE, RATE_BOUND_PERCENT, OFF_LINE = 1.0, 5.0, 0.05
-# migration in range cells at which a peak loses 0.2 dB
-WALK_CELLS = 0.2
-# chosen: Doppler over half the pulse rate from which on a warning is given
-DOPPLER = 0.95
-# power of a focused scatterer over the noise of a line; noise alone exceeds it with the probability
-# exp(-20), one in 5e8
-_PEAK_SNR = 20.0
-# chosen: samples over the aperture at which the warp is evaluated
-_POINTS = 513
-# chosen: frequencies over the band at which migration is evaluated
-_BAND = 17
-# orders of the warp that `rotation_requirements` lists
-_ORDERS = 4
+# samples over the aperture at which the warp is evaluated, and orders of it that
+# `rotation_requirements` lists, both by choice
+_POINTS, _ORDERS = 513, 4
 
 
 def rotation_limits(
@@ -71,10 +57,25 @@ def rotation_limits(
     Raises:
         ValueError: If the shapes differ, the rate is not positive, or a number is not finite.
     """
-    _check(omega_rad_s, k, cross_range_m, lever_m, amplitude)
+    x, lever = cross_range_m, lever_m
+    if not (math.isfinite(omega_rad_s) and omega_rad_s > 0) or not all(math.isfinite(one) for one in k):
+        raise ValueError(
+            f"omega_rad_s must be positive (rad/s) and every k finite, got omega_rad_s={omega_rad_s} and k={list(k)}"
+        )
+    if not x.shape == lever.shape == amplitude.shape or x.ndim != 1 or not len(x):
+        raise ValueError(
+            "cross_range_m, lever_m and amplitude must have the same shape (target,), got the shapes "
+            f"{tuple(x.shape)}, {tuple(lever.shape)} and {tuple(amplitude.shape)}"
+        )
     warp_k, duration = torch.tensor(list(k), dtype=torch.float64), n_pulse / radar.prf_hz
-    fastest = float(_rates(warp_k, duration).max())
-    doppler = 4 * omega_rad_s * fastest * float(cross_range_m.abs().max()) / (radar.wavelength_m * radar.prf_hz)
+    time = torch.linspace(0, duration, _POINTS, dtype=torch.float64)
+    fastest = float(warp_rate(time, warp_k).max())
+    doppler = 4 * omega_rad_s * fastest * float(x.abs().max()) / (radar.wavelength_m * radar.prf_hz)
+    power = amplitude.abs().square()
+    cell = radar.wavelength_m / (2 * omega_rad_s * float(warp(time[-1:], warp_k)))
+    mean_square = (lever.square() * power).sum() / power.sum().clamp_min(torch.finfo(torch.float64).tiny)
+    # noise alone exceeds 20 times its power with the probability exp(-20), one in 5e8
+    above = power * n_pulse > 20 * noise_std**2 if noise_std > 0 else power > 0
     rows = (
         Limit(
             "pulses",
@@ -99,42 +100,15 @@ def rotation_limits(
         Limit(
             "Doppler over half the pulse rate",
             doppler,
-            DOPPLER,
+            0.95,
             "",
-            _beyond(doppler),
+            "refuse" if doppler > 1 else "warn",
             "the edges of the target alias",
             "raise the pulse rate, or take a narrower target",
         ),
-    )
-    return (
-        *rows,
-        *_scene_limits(
-            radar, omega_rad_s * float(_whole(warp_k, duration)), cross_range_m, lever_m, amplitude, noise_std, n_pulse
-        ),
-        *_bound_limit(omega_rad_s, rate_bound),
-    )
-
-
-def _beyond(doppler: float) -> Verdict:
-    """Verdict for a Doppler above its limit."""
-    return "refuse" if doppler > 1 else "warn"
-
-
-def _scene_limits(
-    radar: InverseRadar, angle: float, x: Tensor, lever: Tensor, amplitude: Tensor, noise_std: float, n_pulse: int
-) -> tuple[Limit, ...]:
-    """Limits that the scatterers set."""
-    power = amplitude.abs().square()
-    cell = radar.wavelength_m / (2 * angle)
-    visible = math.pi * radar.wavelength_m * float(_weighted_rms(lever, power)) / cell**2
-    above = int((power * n_pulse > _PEAK_SNR * noise_std**2).sum()) if noise_std > 0 else int((power > 0).sum())
-    no_rate = "the rate, and with it the scale in metres, cannot be estimated, while k1 and k2 can"
-    coupled = "the phases of range term and k1 are nearly equal: the rate cannot be estimated"
-    no_lever: Verdict = "refuse" if not bool((lever.abs() > 0).any()) else "warn"
-    return (
         Limit(
             "scatterers above the noise",
-            above,
+            int(above.sum()),
             3,
             "",
             "refuse",
@@ -144,48 +118,37 @@ def _scene_limits(
         ),
         Limit(
             "range term, pi lambda sigma_y / ra^2",
-            visible,
-            VISIBLE,
+            math.pi * radar.wavelength_m * float(mean_square.sqrt()) / cell**2,
+            1.0,
             "rad",
-            no_lever,
-            no_rate,
+            "warn" if bool((lever != 0).any()) else "refuse",
+            "the rate, and with it the scale in metres, cannot be estimated, while k1 and k2 can",
             "lengthen the aperture",
             at_least=True,
         ),
         Limit(
             "scatterers off a line through the centre",
             _off_line(x, lever, power),
-            OFF_LINE,
+            0.05,
             "",
             "warn",
-            coupled,
+            "the phases of range term and k1 are nearly equal: the rate cannot be estimated",
             "scale the image by a rate from another source",
             at_least=True,
         ),
     )
-
-
-def _bound_limit(omega: float, bound: float | None) -> tuple[Limit, ...]:
-    """Limit of the Cramer-Rao bound of the rate, none where the bound is not given."""
-    if bound is None:
-        return ()
-    consequence = "no estimator determines the scale of the image well, while k1 and k2 focus it"
-    return (
-        Limit(
-            "Cramer-Rao bound of the rate",
-            100 * bound / omega,
-            RATE_BOUND_PERCENT,
-            "%",
-            "warn",
-            consequence,
-            "raise the SNR or lengthen the aperture",
-        ),
+    if rate_bound is None:
+        return rows
+    bound = Limit(
+        "Cramer-Rao bound of the rate",
+        100 * rate_bound / omega_rad_s,
+        5.0,
+        "%",
+        "warn",
+        "no estimator determines the scale of the image well, while k1 and k2 focus it",
+        "raise the SNR or lengthen the aperture",
     )
-
-
-def _weighted_rms(x: Tensor, weight: Tensor) -> Tensor:
-    """Weighted root mean square."""
-    return ((x.square() * weight).sum() / weight.sum().clamp_min(torch.finfo(torch.float64).tiny)).sqrt()
+    return (*rows, bound)
 
 
 def _off_line(x: Tensor, y: Tensor, weight: Tensor) -> float:
@@ -240,15 +203,23 @@ def rotation_requirements(
     """
     warp_k, duration = torch.tensor(list(k), dtype=torch.float64), n_pulse / radar.prf_hz
     c4 = 4 * math.pi / radar.wavelength_m
-    angle = omega_rad_s * float(_whole(warp_k, duration))
+    time = torch.linspace(0, duration, _POINTS, dtype=torch.float64)
+    turned = warp(time, warp_k) * omega_rad_s
+    angle = float(turned[-1])
     walk = cross_range_m * angle / radar.range_step_m
     small = c4 * (cross_range_m * angle**3 / 6 + lever_m * angle**4 / 24)
     single = c4 * (radar.reference_range_m + lever_m) * 2.0**-24
     across = c4 * cross_range_m * omega_rad_s
+    neglects = (
+        "acceleration (range-Doppler)",
+        "jerk and higher terms",
+        "the fourth power of time and higher terms",
+        "the fifth power of time and higher terms",
+    )
     orders = [
         Requirement(
             f"warp of order {order}",
-            _ORDER_NEGLECTS[order],
+            neglects[order - 1],
             across * float(left.abs().max()),
             math.nan,
             tolerance_rad,
@@ -257,8 +228,7 @@ def rotation_requirements(
         )
         for order, left in enumerate(_legendre_left(warp_k, duration), start=1)
     ]
-    turned = warp(torch.linspace(0, duration, _POINTS, dtype=torch.float64), warp_k) * omega_rad_s
-    band = torch.linspace(-0.5, 0.5, _BAND, dtype=torch.float64)
+    band = torch.linspace(-0.5, 0.5, 17, dtype=torch.float64)
     migration = 2 * math.pi * band * cross_range_m / radar.range_step_m * turned[:, None]
     return (
         *orders,
@@ -275,7 +245,7 @@ def rotation_requirements(
             "migration through range cells",
             math.pi * walk,
             walk,
-            math.pi * WALK_CELLS,
+            math.pi * 0.2,  # a migration by which a peak loses 0.2 dB
             "use the fidelity dechirped",
             phase_error_db(migration),
         ),
@@ -354,29 +324,6 @@ def order_loss_db(
     return peak_loss_db(across * _legendre_left(k, duration_s)[order - 1])
 
 
-# terms of the angle that a warp of each order neglects
-_ORDER_NEGLECTS = {
-    1: "acceleration (range-Doppler)",
-    2: "jerk and higher terms",
-    3: "the fourth power of time and higher terms",
-    4: "the fifth power of time and higher terms",
-}
-
-
-def least_order(rows: Sequence[Requirement]) -> int:
-    """Return the least order in time of the rotation angle that focuses a target well enough.
-
-    Args:
-        rows: Simplifications and their errors, as returned by `rotation_requirements`.
-
-    Returns:
-        The least order whose row is permissible; one more than the highest listed order where none
-        is.
-    """
-    orders = [row for row in rows if row.effect.startswith("warp of order")]
-    return next((i for i, row in enumerate(orders, start=1) if row.ok), len(orders) + 1)
-
-
 def _legendre_left(k: Tensor, duration_s: float) -> list[Tensor]:
     """Sum (s) over the aperture of the Legendre terms of the warp beyond orders 1, 2, 3 and 4."""
     s = np.linspace(-1, 1, _POINTS)
@@ -389,26 +336,3 @@ def _legendre_left(k: Tensor, duration_s: float) -> list[Tensor]:
         term = torch.from_numpy(np.polynomial.legendre.legval(s, beyond))
         left.append(torch.zeros_like(term) if float(term.abs().max()) < 1e-12 * duration_s else term)
     return left
-
-
-def _rates(k: Tensor, duration_s: float) -> Tensor:
-    """Rate of the warp over the aperture."""
-    return warp_rate(torch.linspace(0, duration_s, _POINTS, dtype=torch.float64), k)
-
-
-def _whole(k: Tensor, duration_s: float) -> Tensor:
-    """phi(T) in seconds."""
-    return warp(torch.tensor([duration_s], dtype=torch.float64), k)[0]
-
-
-def _check(omega: float, k: Sequence[float], x: Tensor, lever: Tensor, amplitude: Tensor) -> None:
-    """Raise ValueError for an invalid rotation or shapes that differ."""
-    if not (math.isfinite(omega) and omega > 0) or not all(math.isfinite(one) for one in k):
-        raise ValueError(
-            f"omega_rad_s must be positive (rad/s) and every k finite, got omega_rad_s={omega} and k={list(k)}"
-        )
-    if not x.shape == lever.shape == amplitude.shape or x.ndim != 1 or not len(x):
-        raise ValueError(
-            "cross_range_m, lever_m and amplitude must have the same shape (target,), got the shapes "
-            f"{tuple(x.shape)}, {tuple(lever.shape)} and {tuple(amplitude.shape)}"
-        )

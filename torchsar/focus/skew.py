@@ -28,7 +28,8 @@ from torchsar.core import (
     transform_in_blocks,
     untraced,
 )
-from torchsar.focus.omega_k import BAND_EDGE, FrameGeometry, band_weight, is_whole, raised_cosine_band, through_doppler
+from torchsar.focus.frame_geometry import BAND_EDGE, FrameGeometry, band_weight, raised_cosine_band
+from torchsar.focus.omega_k import is_whole, through_doppler
 from torchsar.radar import StripmapRadar
 
 # tolerated excess of the band of an image over its sampling rate, relative to this rate; measured

@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from torchsar.core import checked_samples, real_dtype
+from torchsar.focus.frame_geometry import FrameGeometry
 from torchsar.focus.nufft import Nufft, Points
 from torchsar.focus.omega_k import (
     Focuser,
-    FrameGeometry,
     FrequencyBasis,
     bulk_filter,
     is_below,
@@ -19,9 +19,6 @@ from torchsar.focus.omega_k import (
 )
 from torchsar.focus.skew import DopplerSkew, through_skewed_doppler
 from torchsar.radar import StripmapRadar
-
-# chosen: largest shift in grid points for which float32 positions keep the image error below -80 dB
-_SINGLE = 200.0
 
 
 class StoltMap:
@@ -60,13 +57,10 @@ class StoltMap:
         """
         residual = residual_frequency(at, self.basis.nodes_hz) / self.step_hz
         real = real_dtype(lines.dtype)
-        # float32 serves for small shifts, which are the rule, and takes half the time
-        exact = real if is_below(residual, _SINGLE) else torch.float64
-        shift = self.basis.evaluate(residual, exact)
-        if exact == real:
-            points = Points.of(self.plan.kernel, self.start, self.plan.length, real, shift)
-        else:
-            points = Points.of(self.plan.kernel, self.start + shift, self.plan.length, real)
+        # float32 serves for small shifts, which are the rule, and takes half the time; up to 200
+        # grid points it keeps the error of the image below -80 dB
+        shift = self.basis.evaluate(residual, real if is_below(residual, 200) else torch.float64)
+        points = Points.of(self.plan.kernel, self.start, self.plan.length, real, shift)
         return torch.fft.fftshift(torch.fft.ifft(self.plan.type2(lines, points)), dim=-1)
 
 

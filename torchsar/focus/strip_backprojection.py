@@ -2,92 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from torchsar.core import Signal, checked_samples, per_trial, unit_phasor
 from torchsar.focus.backprojection import direct_sum
-from torchsar.focus.omega_k import Focuser, FrameGeometry
+from torchsar.focus.frame_geometry import FrameGeometry
+from torchsar.focus.omega_k import Focuser
 from torchsar.radar import StripmapRadar
 
-
-class Aperture(Protocol):
-    """Choice of the pulses that contribute to a pixel, as a weight of each pulse."""
-
-    def weight(self, since_s: Tensor, doppler_offset_hz: Tensor) -> Tensor:
-        """Return the weight of each pulse at each pixel, in the shape of the arguments.
-
-        Args:
-            since_s: Slow time in seconds since the line of sight that defines the image
-                coordinates, by default that of the beam centre, crossed the pixel.
-            doppler_offset_hz: Doppler of the pixel relative to the centroid, in Hz.
-        """
-        ...
-
-
-@dataclass(frozen=True)
-class EveryPulse:
-    """Aperture of all recorded pulses."""
-
-    def weight(self, since_s: Tensor, doppler_offset_hz: Tensor) -> Tensor:
-        """Return the weight 1 for each pulse, in the shape of `since_s`.
-
-        Args:
-            since_s: Slow time in seconds since the line of sight that defines the image
-                coordinates, by default that of the beam centre, crossed the pixel.
-            doppler_offset_hz: Doppler of the pixel relative to the centroid, in Hz.
-        """
-        return torch.ones_like(since_s)
-
-
-@dataclass(frozen=True)
-class Integration:
-    """Aperture of the pulses within an integration time about the crossing of the pixel.
-
-    At the crossing, the line of sight that defines the image coordinates, by default that of the
-    beam centre, points to the pixel.
-
-    Args:
-        integration_s: Integration time in seconds.
-    """
-
-    integration_s: float
-
-    def weight(self, since_s: Tensor, doppler_offset_hz: Tensor) -> Tensor:
-        """Return the weight of each pulse: 1 within the integration time and 0 elsewhere.
-
-        Args:
-            since_s: Slow time in seconds since the line of sight that defines the image
-                coordinates, by default that of the beam centre, crossed the pixel.
-            doppler_offset_hz: Doppler of the pixel relative to the centroid, in Hz.
-        """
-        return (since_s.abs() <= self.integration_s / 2).to(since_s.dtype)
-
-
-@dataclass(frozen=True)
-class DopplerBand:
-    """Aperture of the pulses in which the Doppler of the pixel lies in a band about the centroid.
-
-    With the PRF as width, these are the pulses that a focuser in the Doppler domain uses.
-
-    Args:
-        width_hz: Width of the band in Hz.
-    """
-
-    width_hz: float
-
-    def weight(self, since_s: Tensor, doppler_offset_hz: Tensor) -> Tensor:
-        """Return the weight of each pulse: 1 where the Doppler lies in the band and 0 elsewhere.
-
-        Args:
-            since_s: Slow time in seconds since the line of sight that defines the image
-                coordinates, by default that of the beam centre, crossed the pixel.
-            doppler_offset_hz: Doppler of the pixel relative to the centroid, in Hz.
-        """
-        return (doppler_offset_hz.abs() <= self.width_hz / 2).to(since_s.dtype)
+# weight of each pulse at each pixel, of two tensors of one shape (..., pulse, pixel): slow time in
+# seconds since the line of sight that defines the image coordinates, by default that of the beam
+# centre, crossed the pixel; and Doppler of the pixel relative to the centroid in Hz
+Aperture = Callable[[Tensor, Tensor], Tensor]
 
 
 def backproject_strip(
@@ -128,8 +58,9 @@ def backproject_strip(
             centroid where the radar has none.
         reference: Spectrum of the range compression filter, shape (range,); None for
             range-compressed data.
-        aperture: Pulses that contribute to a pixel, such as `Integration` or `DopplerBand`; None
-            for all.
+        aperture: Function of slow time in seconds since that line of sight crossed the pixel, and
+            of the Doppler relative to the centroid in Hz, that returns the weights of the pulses;
+            None for all alike.
         start_s: Slow time of the first pulse in seconds.
         eps: Relative error of the interpolation in range.
         block_bytes: Size of a working array in bytes.
@@ -151,9 +82,7 @@ def backproject_strip(
         *(torch.as_tensor(v, dtype=torch.float64, device=raw.device) for v in (azimuth_m, range_m))
     )
     shape, x, r = x.shape, x.reshape(-1), r.reshape(-1)
-    geometry = _PixelGeometry(
-        radar, at.velocity_m_s, at.frame_hz, per_trial(doppler_hz, 2, x), aperture or EveryPulse()
-    )
+    geometry = _PixelGeometry(radar, at.velocity_m_s, at.frame_hz, per_trial(doppler_hz, 2, x), aperture)
     lines, n = raw.shape[-2:]
     pulse_s = start_s + torch.arange(lines, dtype=torch.float64, device=raw.device)[:, None] / radar.prf_hz
     beyond = r - radar.near_range_m
@@ -193,7 +122,7 @@ class _PixelGeometry:
     velocity_m_s: Tensor
     frame_hz: Tensor
     centroid_hz: Tensor
-    aperture: Aperture
+    aperture: Aperture | None
 
     def __call__(self, pulse_s: Tensor, azimuth_m: Tensor, range_m: Tensor) -> tuple[Tensor, Tensor]:
         """Return r(t) - R in metres and the weight, float64 (..., pulse, pixel), for pulses (pulse,
@@ -206,9 +135,9 @@ class _PixelGeometry:
         excess = along * (along - 2 * range_m * sin)
         slant = torch.sqrt(range_m.square() + excess)
         doppler = 2 * velocity * (range_m * sin - along) / (slant * self.radar.wavelength_m)
-        return excess / (slant + range_m), self.aperture.weight(
-            *torch.broadcast_tensors(since, doppler - self.centroid_hz)
-        )
+        since, offset = torch.broadcast_tensors(since, doppler - self.centroid_hz)
+        weight = torch.ones_like(since) if self.aperture is None else self.aperture(since, offset)
+        return excess / (slant + range_m), weight.to(since.dtype)
 
 
 class Backproject(Focuser):
@@ -227,8 +156,9 @@ class Backproject(Focuser):
         lines: First raw line of the patch and the line after its last; None for all lines.
         cells: First range cell of the patch and the cell after its last; None for all cells.
         oversampling: Pixels per raw sample along either axis.
-        aperture: Pulses that contribute to a pixel, such as `Integration` or `DopplerBand`; None
-            for all.
+        aperture: Function of slow time in seconds since that line of sight crossed the pixel, and
+            of the Doppler relative to the centroid in Hz, that returns the weights of the pulses;
+            None for all alike.
         eps: Relative error of the interpolation in range.
 
     Raises:

@@ -9,53 +9,10 @@ Reference:
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
-import torch
-from torch import Tensor
-
 from torchsar.focus.nufft import Kernel
-from torchsar.focus.warped_sums import Compiled, Explicit, Gridded, Resampled, Sum
-
-# relative error at which the rounding of complex64 data begins to dominate
-_EPS = 1e-6
-
-
-@dataclass(frozen=True)
-class PulsesToLines:
-    """Pulses and image lines between which one matched Fourier transform maps.
-
-    Args:
-        warp_k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + k2 t^3 / 3! + ... in 1/s,
-            1/s^2, ..., shape (..., order - 1), float64.
-        n_pulse: Number of pulses.
-        prf_hz: Pulse rate in Hz.
-        u: Rotation angle at each pulse over that of the whole aperture, shape (..., pulse),
-            float64.
-        cells_per_line: Step between image lines in Doppler cells, 1 / aperture time, shape (...,),
-            float64.
-        lines: Number of image lines.
-        dtype: Complex type of the data.
-    """
-
-    warp_k: Tensor
-    n_pulse: int
-    prf_hz: float
-    u: Tensor
-    cells_per_line: Tensor
-    lines: int
-    dtype: torch.dtype
-
-    @property
-    def points(self) -> Tensor:
-        """Phase step of each pulse from line to line in cycles, shape (..., pulse), float64."""
-        return self.u * self.cells_per_line[..., None]
-
-    @property
-    def scale(self) -> float:
-        """Factor on the sum over pulses, 1 / sqrt(number of pulses)."""
-        return 1 / math.sqrt(self.n_pulse)
+from torchsar.focus.warped_sums import PulsesToLines, Sum, compiled, explicit, gridded, resampled
 
 
 @dataclass(frozen=True)
@@ -91,7 +48,8 @@ class Gridding:
         """Kaiser-Bessel kernel of the given width or relative error."""
         if self.taps is not None:
             return Kernel(self.taps, 2.0 if self.oversampling is None else self.oversampling)
-        eps, oversampling = _EPS if self.eps is None else self.eps, self.oversampling
+        # below 1e-6 the rounding of complex64 data begins to dominate
+        eps, oversampling = 1e-6 if self.eps is None else self.eps, self.oversampling
         if oversampling is None:
             oversampling = 1.5 if eps > Kernel(16, 1.5).error else 2.0
         return Kernel.of(eps, oversampling, even=True)
@@ -105,7 +63,7 @@ class Gridding:
         Returns:
             The map.
         """
-        return Gridded(of.points, of.lines, self.kernel, of.dtype, of.scale)
+        return gridded(of, self.kernel)
 
 
 @dataclass(frozen=True)
@@ -121,7 +79,7 @@ class ExplicitSum:
         Returns:
             The map.
         """
-        return Explicit(of.points, of.lines, of.dtype, of.scale)
+        return explicit(of)
 
 
 @dataclass(frozen=True)
@@ -155,7 +113,7 @@ class Resampling:
         Returns:
             The map.
         """
-        return Resampled(of.warp_k, of.n_pulse, of.prf_hz, of.cells_per_line, of.lines, self.interpolation, of.scale)
+        return resampled(of, self.interpolation)
 
 
 @dataclass(frozen=True)
@@ -182,7 +140,7 @@ class CompiledNufft:
         Raises:
             ModuleNotFoundError: If finufft is not installed.
         """
-        return Compiled(of.points, of.lines, Gridding().kernel.error if self.eps is None else self.eps, of.scale)
+        return compiled(of, Gridding().kernel.error if self.eps is None else self.eps)
 
 
 # choices that `matched_fourier` accepts

@@ -5,8 +5,8 @@ The transform images a target that rotates non-uniformly. From pulses s_p it for
     I_l = scale * sum_p s_p exp(+j 2 pi l x_p),    l = -(lines // 2), -(lines // 2) + 1, ...
 
 where x_p is the phase step of pulse p from one line to the next in cycles. It is proportional to
-the rotation angle at pulse p. `Explicit` evaluates the sum directly. `Gridded` and `Compiled` use a
-non-uniform FFT. `Resampled` interpolates the pulses to equal steps of rotation angle and uses an
+the rotation angle at pulse p. `explicit` evaluates the sum directly. `gridded` and `compiled` use a
+non-uniform FFT. `resampled` interpolates the pulses to equal steps of rotation angle and uses an
 FFT. The settings of these methods are held by the classes of `focus.transforms`.
 
 Reference:
@@ -18,7 +18,10 @@ from __future__ import annotations
 
 import importlib
 import math
-from typing import Any, Protocol
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,7 +31,7 @@ from torchsar.core import block_bytes_of, linear_phasor, numbers_on
 from torchsar.core.spline import second_differences
 from torchsar.focus.chirp_z import chirp_z
 from torchsar.focus.gridding import PulseNufft
-from torchsar.focus.nufft import Kernel
+from torchsar.focus.nufft import Kernel, cropped
 from torchsar.radar.warp import warp, warp_rate
 
 
@@ -84,182 +87,135 @@ def whole_warp(k: Tensor, duration_s: float) -> Tensor:
     return warp(numbers_on(k.device, duration_s), k)
 
 
-class Sum(Protocol):
-    """Linear map from pulses to image lines by a Fourier sum over pulses, with its adjoint."""
-
-    def forward(self, pulses: Tensor) -> Tensor:
-        """Transform pulses into image lines.
-
-        Args:
-            pulses: Pulses, shape (..., pulse, range), complex.
-
-        Returns:
-            Image lines, shape (..., line, range).
-        """
-        ...
-
-    def adjoint(self, image: Tensor) -> Tensor:
-        """Transform image lines into pulses by the adjoint of `forward`.
-
-        Args:
-            image: Image lines, shape (..., line, range), complex.
-
-        Returns:
-            Pulses, shape (..., pulse, range).
-        """
-        ...
-
-
-class Gridded:
-    """Image lines as Fourier sums over pulses, by a non-uniform FFT with gridding.
-
-    See `focus.gridding`.
+@dataclass(frozen=True)
+class PulsesToLines:
+    """Pulses and image lines between which one matched Fourier transform maps.
 
     Args:
-        points: Phase step of each pulse from one image line to the next in cycles, shape (...,
-            pulse), float64.
-        lines: Number of image lines.
-        kernel: Gridding kernel.
-        dtype: Complex type of the data.
-        scale: Factor on the sum.
-    """
-
-    def __init__(self, points: Tensor, lines: int, kernel: Kernel, dtype: torch.dtype, scale: float) -> None:
-        self.plan = PulseNufft(lines, kernel, dtype, points.device, scale)
-        self.points = self.plan.points(points)
-
-    def forward(self, pulses: Tensor) -> Tensor:
-        """Transform pulses into image lines.
-
-        Args:
-            pulses: Pulses, shape (..., pulse, range), complex.
-
-        Returns:
-            Image lines, shape (..., line, range).
-        """
-        return self.plan.type1(pulses, self.points)
-
-    def adjoint(self, image: Tensor) -> Tensor:
-        """Transform image lines into pulses by the adjoint of `forward`.
-
-        Args:
-            image: Image lines, shape (..., line, range), complex.
-
-        Returns:
-            Pulses, shape (..., pulse, range).
-        """
-        return self.plan.type2(image, self.points)
-
-
-class Explicit:
-    """Image lines as Fourier sums over pulses, evaluated directly in blocks of lines.
-
-    Args:
-        points: Phase step of each pulse from one image line to the next in cycles, shape (...,
-            pulse), float64.
-        lines: Number of image lines.
-        dtype: Complex type of the data.
-        scale: Factor on the sum.
-    """
-
-    def __init__(self, points: Tensor, lines: int, dtype: torch.dtype, scale: float) -> None:
-        self.points, self.lines, self.dtype, self.scale = points, lines, dtype, scale
-
-    def _blocks(self) -> list[tuple[int, int]]:
-        """First line and number of lines of each block."""
-        size = max(16, 32 * block_bytes_of(self.points.device) // (self.points.numel() * self.dtype.itemsize))
-        return [(at, min(size, self.lines - at)) for at in range(0, self.lines, size)]
-
-    def _matrix(self, at: int, count: int) -> Tensor:
-        """Matrix (..., pulse, line) of a block of lines."""
-        return self.scale * linear_phasor(self.points, at - self.lines // 2, count, self.dtype)
-
-    def forward(self, pulses: Tensor) -> Tensor:
-        """Transform pulses into image lines.
-
-        Args:
-            pulses: Pulses, shape (..., pulse, range), complex.
-
-        Returns:
-            Image lines, shape (..., line, range).
-        """
-        return torch.cat([self._matrix(*block).mT @ pulses for block in self._blocks()], -2)
-
-    def adjoint(self, image: Tensor) -> Tensor:
-        """Transform image lines into pulses by the adjoint of `forward`.
-
-        Args:
-            image: Image lines, shape (..., line, range), complex.
-
-        Returns:
-            Pulses, shape (..., pulse, range).
-        """
-        parts = [self._matrix(at, count).conj() @ image[..., at : at + count, :] for at, count in self._blocks()]
-        return torch.stack(parts).sum(0)
-
-
-class Resampled:
-    """Image lines as Fourier sums over pulses, by interpolation of the pulses and an FFT.
-
-    The pulses are interpolated to equal steps of rotation angle. An FFT of them gives equal weight
-    to equal steps of angle, but the sum over pulses gives equal weight to equal steps of time. The
-    interpolated pulses are therefore divided by the rotation rate relative to its mean.
-
-    Args:
-        k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + k2 t^3 / 3! + ... in 1/s, 1/s^2,
-            ..., shape (..., order - 1), float64.
+        warp_k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + k2 t^3 / 3! + ... in 1/s,
+            1/s^2, ..., shape (..., order - 1), float64.
         n_pulse: Number of pulses.
         prf_hz: Pulse rate in Hz.
-        step: Step between image lines in Doppler cells, shape (...,), float64. A Doppler cell is
-            the inverse of the aperture time.
+        u: Rotation angle at each pulse over that of the whole aperture, shape (..., pulse),
+            float64.
+        cells_per_line: Step between image lines in Doppler cells, 1 / aperture time, shape (...,),
+            float64.
         lines: Number of image lines.
-        interpolation: "linear" or "spline".
-        scale: Factor on the sum.
+        dtype: Complex type of the data.
     """
 
-    def __init__(
-        self, k: Tensor, n_pulse: int, prf_hz: float, step: Tensor, lines: int, interpolation: str, scale: float
-    ) -> None:
-        self.step, self.lines, self.n_pulse = step, lines, n_pulse
-        self.interpolate = {"linear": _linear, "spline": _spline}[interpolation]
-        time = times_of_even_angle(k, n_pulse, prf_hz)
-        rate = warp_rate(time, k) * (n_pulse / prf_hz) / whole_warp(k, n_pulse / prf_hz)
-        self.position, self.factor = time * prf_hz, scale / rate
+    warp_k: Tensor
+    n_pulse: int
+    prf_hz: float
+    u: Tensor
+    cells_per_line: Tensor
+    lines: int
+    dtype: torch.dtype
 
-    def forward(self, pulses: Tensor) -> Tensor:
-        """Transform pulses into image lines.
+    @property
+    def points(self) -> Tensor:
+        """Phase step of each pulse from line to line in cycles, shape (..., pulse), float64."""
+        return self.u * self.cells_per_line[..., None]
 
-        Args:
-            pulses: Pulses, shape (..., pulse, range), complex.
+    @property
+    def scale(self) -> float:
+        """Factor on the sum over pulses, 1 / sqrt(number of pulses)."""
+        return 1 / math.sqrt(self.n_pulse)
 
-        Returns:
-            Image lines, shape (..., line, range).
-        """
-        even = self.interpolate(pulses, self.position) * self.factor.to(pulses.real.dtype)[..., None]
-        length = round(self.n_pulse / float(self.step)) if self.step.ndim == 0 and not self.step.requires_grad else 0
-        if length < self.lines or abs(length * float(self.step) - self.n_pulse) > 1e-9 * self.n_pulse:
-            step = self.step[..., None] / self.n_pulse
-            return chirp_z(even.mT, self.lines // 2 * step, -step, self.lines, centre=0).mT
-        whole, half = torch.fft.ifft(even.mT, length, norm="forward"), self.lines // 2
-        return torch.cat([whole[..., length - half :], whole[..., : self.lines - half]], -1).mT
 
-    def adjoint(self, image: Tensor) -> Tensor:
-        """Transform image lines into pulses by the adjoint of `forward`.
+@dataclass(frozen=True)
+class Sum:
+    """Linear map from pulses to image lines by a Fourier sum over pulses, with its adjoint.
 
-        The adjoint is found by automatic differentiation of the linear map.
+    Args:
+        forward: Function of pulses (..., pulse, range), complex, that returns the image lines (...,
+            line, range).
+        adjoint: Function of image lines that returns pulses, the adjoint of `forward`.
+    """
 
-        Args:
-            image: Image lines, shape (..., line, range), complex.
+    forward: Callable[[Tensor], Tensor]
+    adjoint: Callable[[Tensor], Tensor]
 
-        Returns:
-            Pulses, shape (..., pulse, range).
-        """
-        trials = np.broadcast_shapes(image.shape[:-2], self.position.shape[:-1])
+
+def gridded(of: PulsesToLines, kernel: Kernel) -> Sum:
+    """Form the sum by a non-uniform FFT with gridding, see `focus.gridding`.
+
+    Args:
+        of: Pulses and image lines.
+        kernel: Gridding kernel.
+
+    Returns:
+        The sum and its adjoint.
+    """
+    plan = PulseNufft(of.lines, kernel, of.dtype, of.u.device, of.scale)
+    points = plan.points(of.points)
+    return Sum(partial(plan.type1, points=points), partial(plan.type2, points=points))
+
+
+def explicit(of: PulsesToLines) -> Sum:
+    """Form the sum directly, in blocks of lines.
+
+    Args:
+        of: Pulses and image lines.
+
+    Returns:
+        The sum and its adjoint.
+    """
+    points, lines = of.points, of.lines
+    size = max(16, 32 * block_bytes_of(points.device) // (points.numel() * of.dtype.itemsize))
+    blocks = [(at, min(size, lines - at)) for at in range(0, lines, size)]
+
+    def matrix(at: int, count: int) -> Tensor:
+        """Matrix (..., pulse, line) of a block of lines."""
+        return of.scale * linear_phasor(points, at - lines // 2, count, of.dtype)
+
+    def forward(pulses: Tensor) -> Tensor:
+        return torch.cat([matrix(*block).mT @ pulses for block in blocks], -2)
+
+    def adjoint(image: Tensor) -> Tensor:
+        parts = [matrix(at, count).conj() @ image[..., at : at + count, :] for at, count in blocks]
+        return torch.stack(parts).sum(0)
+
+    return Sum(forward, adjoint)
+
+
+def resampled(of: PulsesToLines, interpolation: str) -> Sum:
+    """Form the sum by interpolation of the pulses to equal steps of rotation angle, and an FFT.
+
+    An FFT gives equal weight to equal steps of angle, but the sum over pulses gives equal weight to
+    equal steps of time. The interpolated pulses are therefore divided by the rotation rate relative
+    to its mean.
+
+    Args:
+        of: Pulses and image lines.
+        interpolation: "linear" or "spline".
+
+    Returns:
+        The sum and its adjoint, by automatic differentiation of the linear map.
+    """
+    step, lines, n_pulse = of.cells_per_line, of.lines, of.n_pulse
+    interpolate = {"linear": _linear, "spline": _spline}[interpolation]
+    time = times_of_even_angle(of.warp_k, n_pulse, of.prf_hz)
+    duration = n_pulse / of.prf_hz
+    rate = warp_rate(time, of.warp_k) * duration / whole_warp(of.warp_k, duration)
+    position, factor = time * of.prf_hz, of.scale / rate
+
+    def forward(pulses: Tensor) -> Tensor:
+        even = interpolate(pulses, position) * factor.to(pulses.real.dtype)[..., None]
+        length = round(n_pulse / float(step)) if step.ndim == 0 and not step.requires_grad else 0
+        if length < lines or abs(length * float(step) - n_pulse) > 1e-9 * n_pulse:
+            per_pulse = step[..., None] / n_pulse
+            return chirp_z(even.mT, lines // 2 * per_pulse, -per_pulse, lines, centre=0).mT
+        return cropped(torch.fft.ifft(even.mT, length, norm="forward"), lines).mT
+
+    def adjoint(image: Tensor) -> Tensor:
+        trials = np.broadcast_shapes(image.shape[:-2], position.shape[:-1])
         with torch.enable_grad():
-            pulses = image.new_zeros(*trials, self.n_pulse, image.shape[-1]).requires_grad_()
-            return torch.autograd.grad(
-                self.forward(pulses), pulses, image.expand(*trials, *image.shape[-2:]), create_graph=image.requires_grad
-            )[0]
+            pulses = image.new_zeros(*trials, n_pulse, image.shape[-1]).requires_grad_()
+            wanted = image.expand(*trials, *image.shape[-2:])
+            return torch.autograd.grad(forward(pulses), pulses, wanted, create_graph=image.requires_grad)[0]
+
+    return Sum(forward, adjoint)
 
 
 def times_of_even_angle(k: Tensor, n_pulse: int, prf_hz: float) -> Tensor:
@@ -329,53 +285,32 @@ def _pulses_at(pulses: Tensor, index: Tensor) -> Tensor:
     return pulses.expand(*trials, *pulses.shape[-2:]).gather(-2, index[..., None].expand(shape))
 
 
-class Compiled:
-    """Image lines as Fourier sums over pulses, by the compiled library finufft in float64.
+def compiled(of: PulsesToLines, eps: float) -> Sum:
+    """Form the sum by the compiled library finufft in float64.
 
     Data of any precision are transformed in float64. In single precision the library would round
     points far from zero by a thousandth of a Doppler cell.
 
     Args:
-        points: Phase step of each pulse from one image line to the next in cycles, shape (...,
-            pulse), float64.
-        lines: Number of image lines.
+        of: Pulses and image lines.
         eps: Relative error of the image lines.
-        scale: Factor on the sum.
+
+    Returns:
+        The sum and its adjoint.
 
     Raises:
         ModuleNotFoundError: If finufft is not installed.
     """
+    _library()
+    points = of.points
 
-    def __init__(self, points: Tensor, lines: int, eps: float, scale: float) -> None:
-        _library()
-        self.points, self.lines, self.eps, self.scale = points, lines, eps, scale
+    def work(x: Tensor, lines: int) -> Tensor:
+        trials = np.broadcast_shapes(x.shape[:-2], points.shape[:-1])
+        double = x.expand(*trials, *x.shape[-2:]).to(torch.complex128)
+        made = _CompiledSum.apply(double, points.expand(*trials, points.shape[-1]), lines, eps)
+        return made.to(x.dtype) * of.scale
 
-    def forward(self, pulses: Tensor) -> Tensor:
-        """Transform pulses into image lines.
-
-        Args:
-            pulses: Pulses, shape (..., pulse, range), complex.
-
-        Returns:
-            Image lines, shape (..., line, range).
-        """
-        return _CompiledSum.apply(*self._together(pulses), self.lines, self.eps).to(pulses.dtype) * self.scale
-
-    def adjoint(self, image: Tensor) -> Tensor:
-        """Transform image lines into pulses by the adjoint of `forward`.
-
-        Args:
-            image: Image lines, shape (..., line, range), complex.
-
-        Returns:
-            Pulses, shape (..., pulse, range).
-        """
-        return _CompiledSum.apply(*self._together(image), 0, self.eps).to(image.dtype) * self.scale
-
-    def _together(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Data and points with the same trials, in double precision."""
-        trials = np.broadcast_shapes(x.shape[:-2], self.points.shape[:-1])
-        return x.expand(*trials, *x.shape[-2:]).to(torch.complex128), self.points.expand(*trials, self.points.shape[-1])
+    return Sum(partial(work, lines=of.lines), partial(work, lines=0))
 
 
 class _CompiledSum(torch.autograd.Function):

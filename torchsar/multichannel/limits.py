@@ -15,7 +15,7 @@ import math
 
 import torch
 
-from torchsar.focus.ladar_requirements import Limit
+from torchsar.focus.requirements import Limit
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.reconstruct import POOR, LeastSquares, condition_number, largest_condition
 from torchsar.multichannel.requirements import MultichannelUse

@@ -22,8 +22,7 @@ from torch import Tensor
 
 from torchsar.core import Axis, Signal, Stage, centred_ifft, checked_samples
 from torchsar.focus import omega_k, omega_k_stolt
-from torchsar.focus.ladar_requirements import Limit
-from torchsar.focus.requirements import Aperture, phase_error_db
+from torchsar.focus.requirements import Aperture, Limit, phase_error_db
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.reconstruct import (
     LeastSquares,

@@ -32,7 +32,7 @@ from torchsar.core import (
     over_blocks,
     power_of,
 )
-from torchsar.focus.defocus import InvertibleOmegaK, all_pass
+from torchsar.focus.stored_omega_k import InvertibleOmegaK, all_pass
 from torchsar.radar import StripmapRadar
 
 # chosen: relative change in power of the missing lines, below which they count as settled

@@ -13,7 +13,8 @@ from torch.utils._pytree import tree_map
 
 from torchsar.compensate.pulse_phase.data import without_line
 from torchsar.core import Estimate, Outcome, checked_samples
-from torchsar.focus import ImageGrid, TileOperator, TilePlan
+from torchsar.focus import ImageGrid, TilePlan
+from torchsar.focus.tile_operator import TileOperator
 from torchsar.radar import LIGHT_M_S, AntennaPath
 from torchsar.radar.antenna_path import refuse_unusable
 from torchsar.radar.spotlight import frequency_step_hz

@@ -14,7 +14,7 @@ from torchsar.compensate.path.ground import corrected, line_free, slope
 from torchsar.compensate.pulse_phase.data import or_one
 from torchsar.compensate.pulse_phase.fixed_point import Wiener
 from torchsar.core import cis
-from torchsar.focus import TileOperator
+from torchsar.focus.tile_operator import TileOperator
 from torchsar.radar import LIGHT_M_S, AntennaPath
 from torchsar.radar.spotlight import frequency_samples
 

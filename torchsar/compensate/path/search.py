@@ -16,8 +16,8 @@ from torchsar.compensate.pulse_phase.fixed_point import Run, Wiener, fixed_point
 from torchsar.compensate.pulse_phase.imaging import Through
 from torchsar.compensate.pulse_phase.sharpness import sharpness_beyond_speckle, sharpness_of_noise
 from torchsar.core import cis, real_dtype
-from torchsar.focus import TileOperator
 from torchsar.focus.spotlight import window_weights
+from torchsar.focus.tile_operator import TileOperator
 from torchsar.metrics import entropy, residual_phase
 from torchsar.radar import LIGHT_M_S
 from torchsar.radar.spotlight import frequency_samples, range_profiles

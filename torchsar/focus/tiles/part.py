@@ -13,9 +13,10 @@ from torch.nn.functional import pad
 
 from torchsar.core import linear_solve, outer_phasor, phasor_tables, real_dtype, unit_phasor, untraced
 from torchsar.focus.image_grid import ImageGrid
-from torchsar.focus.tiles.choice import CHUNK, Choice, profile_length
+from torchsar.focus.tiles.choice import CHUNK, Choice
 from torchsar.focus.tiles.expansion import MOMENTS, Expansion, curvatures, slopes
 from torchsar.focus.tiles.kernels import CROSS_OVERSAMPLING, node_values, spread_kernel, window_length, window_slope
+from torchsar.focus.tiles.scene import profile_length
 
 # pulses to which the polynomials of a part are fitted, and samples of s for each node to which the
 # values of the nodes are fitted, both by choice: fits to 24 and 64 pulses differed by 0.2 dB at
@@ -285,7 +286,8 @@ class Part:
         trials, stride = profiles.shape[-2:]
         base = torch.arange(paths * pulses * trials, device=profiles.device).reshape(paths, pulses, trials) * stride
         index = (tables.first[..., None] + base).reshape(-1)
-        x = _Cut.apply(profiles.reshape(-1), index, self.samples).view(tiles, paths, pulses, trials, self.samples)
+        x = _Windows.apply(profiles.reshape(-1), index, self.samples, 0)
+        x = x.view(tiles, paths, pulses, trials, self.samples)
         x = _times(x, tables.before[..., None, :])
         half = (self.samples - self.length) // 2
         # the slopes overlap outside the part that is used
@@ -437,66 +439,37 @@ def _spreading(below: Tensor, weights: Tensor, nodes: int) -> tuple[Tensor, Tens
     return spread.unflatten(-1, (joined, height)), node
 
 
-class _Cut(torch.autograd.Function):
-    """Windows of n adjacent samples; the adjoint of `_Lay`."""
+class _Windows(torch.autograd.Function):
+    """Windows of n adjacent samples, or for a size above 0 its adjoint: the sum of windows at their
+    places among so many samples.
+    """
 
     @staticmethod
-    def forward(x: Tensor, index: Tensor, n: int) -> Tensor:
-        return x.as_strided((len(x) - n + 1, n), (1, 1)).index_select(0, index)
+    def forward(x: Tensor, index: Tensor, n: int, size: int) -> Tensor:
+        if not size:
+            return x.as_strided((len(x) - n + 1, n), (1, 1)).index_select(0, index)
+        at = index[:, None] + torch.arange(n, device=index.device)
+        return x.new_zeros(size).index_add_(0, at.reshape(-1), x.reshape(-1))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
-        x, index, ctx.n = inputs
-        ctx.size = len(x)
+        x, index, ctx.n, ctx.size = inputs
+        ctx.other = 0 if ctx.size else len(x)
         ctx.save_for_backward(index)
         ctx.save_for_forward(index)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return _Lay.apply(gradient, *ctx.saved_tensors, ctx.size), None, None
+        return _Windows.apply(gradient.contiguous(), *ctx.saved_tensors, ctx.n, ctx.other), None, None, None
 
     @staticmethod
     def jvp(ctx: Any, tangent: Tensor, *_: None) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return _Cut.apply(tangent.contiguous(), *ctx.saved_tensors, ctx.n)
+        return _Windows.apply(tangent.contiguous(), *ctx.saved_tensors, ctx.n, ctx.size)
 
     @staticmethod
-    def vmap(info: Any, in_dims: tuple, x: Tensor, index: Tensor, n: int) -> tuple[Tensor, int]:
-        count, size = info.batch_size, x.shape[1 - in_dims[0]]
-        windows = _Cut.apply(x.movedim(in_dims[0], 0).reshape(-1), _each(index, count, size), n)
-        return windows.unflatten(0, (count, -1)), 0
-
-
-class _Lay(torch.autograd.Function):
-    """Sum of windows at their places among so many samples; the adjoint of `_Cut`."""
-
-    @staticmethod
-    def forward(windows: Tensor, index: Tensor, size: int) -> Tensor:
-        at = index[:, None] + torch.arange(windows.shape[-1], device=index.device)
-        return windows.new_zeros(size).index_add_(0, at.reshape(-1), windows.reshape(-1))
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
-        windows, index, ctx.size = inputs
-        ctx.n = windows.shape[-1]
-        ctx.save_for_backward(index)
-        ctx.save_for_forward(index)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return _Cut.apply(gradient.contiguous(), *ctx.saved_tensors, ctx.n), None, None
-
-    @staticmethod
-    def jvp(ctx: Any, tangent: Tensor, *_: None) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return _Lay.apply(tangent, *ctx.saved_tensors, ctx.size)
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple, windows: Tensor, index: Tensor, size: int) -> tuple[Tensor, int]:
-        joined = windows.movedim(in_dims[0], 0).flatten(0, 1)
-        return _Lay.apply(joined, _each(index, info.batch_size, size), info.batch_size * size).unflatten(
-            0, (info.batch_size, size)
-        ), 0
-
-
-def _each(index: Tensor, count: int, size: int) -> Tensor:
-    """Places in each of so many rows of that size, which stand one after another."""
-    return (torch.arange(count, device=index.device)[:, None] * size + index).reshape(-1)
+    def vmap(info: Any, in_dims: tuple, x: Tensor, index: Tensor, n: int, size: int) -> tuple[Tensor, int]:
+        count, joined = info.batch_size, x.movedim(in_dims[0], 0)
+        # the samples of all items stand one after another
+        start = torch.arange(count, device=index.device)[:, None] * (size or joined.shape[1])
+        every = _Windows.apply(joined.flatten(0, 1), (start + index).reshape(-1), n, count * size)
+        return every.unflatten(0, (count, -1)), 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -16,9 +16,10 @@ from torch.utils.checkpoint import checkpoint
 from torchsar.core import block_bytes_of, checked_samples, is_traced, over_blocks, untraced
 from torchsar.focus.backprojection import direct_sum, expanded_history
 from torchsar.focus.image_grid import ImageGrid
-from torchsar.focus.tiles.choice import Lit, Scene, Weight, choose, part_bounds, tile_centres, tile_heights
+from torchsar.focus.tiles.choice import choose, error_db
 from torchsar.focus.tiles.expansion import slopes
 from torchsar.focus.tiles.part import Band, Part, Tables
+from torchsar.focus.tiles.scene import Lit, Scene, Weight, part_bounds, tile_centres, tile_heights
 from torchsar.radar.antenna_path import AntennaPath, refuse_unusable
 from torchsar.radar.spotlight import frequency_step_hz
 from torchsar.radar.stripmap import LIGHT_M_S
@@ -31,9 +32,6 @@ _KEPT_BYTES = 3 << 27
 _GROUP = 16
 # bytes of profiles that are formed at once, by choice: it limits the memory of the padded spectra
 _PROFILE_BYTES = 1 << 25
-# predicted error above the wanted one for which a changed path needs no new plan, by choice: within
-# the 3 dB by which predictions may be off in all, since those of changed paths are within 1 dB
-_LEEWAY_DB = 2.0
 
 
 class _Kept(dict):
@@ -200,9 +198,10 @@ class TilePlan:
             places = [place.detach() for place in plan._places]
             plan._tables = _Kept(len(places[0]) * plan._table_count)
             with torch.no_grad():
-                error_db = self._error_db(places)
-                if error_db <= self.error_db + _LEEWAY_DB:
-                    plan.choice = replace(self.choice, error_db=error_db)
+                predicted = self._error_db(places)
+                # predictions of changed paths are within 1 dB, and 3 dB in all are promised
+                if predicted <= self.error_db + 2:
+                    plan.choice = replace(self.choice, error_db=predicted)
                 else:
                     plan._plan(places)
         return plan
@@ -214,7 +213,7 @@ class TilePlan:
         if [v.shape[1:] for v in places] != [v.shape[1:] for v in self._places]:
             return math.inf
         covered = all(part.covers(places) for zone in self._zones for part in zone)
-        return self._scene.error_db(self.choice, places) if covered else math.inf
+        return error_db(self._scene.judging(places), self.choice) if covered else math.inf
 
     def image(self, history: Tensor) -> Tensor:
         """Form the images of phase histories.
@@ -428,23 +427,3 @@ def image_tiles(
             pixels that are spread over the image, or tiles do not reach the error in this geometry.
     """
     return TilePlan(frequency_hz, transmitter_m, receiver_m, reference_m, grid, error_db, lit, weight).image(history)
-
-
-def possible_tiles(errors_db: Iterable[float], *given: Any, **lit: Any) -> dict[float, TilePlan]:
-    """Plan an image with several errors, from the largest on.
-
-    Args:
-        errors_db: Errors in dB, falling.
-        *given: Arguments of `TilePlan` before the error.
-        **lit: Arguments of `TilePlan` behind the error.
-
-    Returns:
-        Plans by error, up to the first that the geometry does not allow.
-    """
-    plans: dict[float, TilePlan] = {}
-    for error in errors_db:
-        try:
-            plans[error] = TilePlan(*given, error_db=error, **lit)
-        except ValueError:
-            break
-    return plans

@@ -28,7 +28,7 @@ from torchsar.compensate import (
 )
 from torchsar.core import Draws, Estimate, Signal, Truth
 from torchsar.echo import simulate_turntable
-from torchsar.focus import mean_rate
+from torchsar.focus.image_lines import mean_rate
 from torchsar.metrics import contrast, entropy
 from torchsar.reproduce.isal_rotation.common import focused, in_metres, known_of, ladar, second_order
 from torchsar.reproduce.item import Check, Item, falling, number, statement

@@ -20,7 +20,8 @@ from torchsar import plot
 from torchsar.compensate import uneven_rotation
 from torchsar.core import Axis, Draws, Signal
 from torchsar.echo import simulate_turntable
-from torchsar.focus import DopplerLines, cross_range_of, matched_fourier, range_phase
+from torchsar.focus import DopplerLines, matched_fourier, range_phase
+from torchsar.focus.image_lines import cross_range_of
 from torchsar.radar import InverseRadar
 from torchsar.reproduce.isal_rotation.common import known_of, ladar
 from torchsar.reproduce.item import Check, Item, statement

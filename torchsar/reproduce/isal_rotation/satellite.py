@@ -26,7 +26,8 @@ from torchsar.compensate import (
 )
 from torchsar.core import Axis, Draws, Estimate, Signal, Truth
 from torchsar.echo import simulate_turntable
-from torchsar.focus import MatchedFourier, mean_rate
+from torchsar.focus import MatchedFourier
+from torchsar.focus.image_lines import mean_rate
 from torchsar.metrics import entropy, impulse_response
 from torchsar.radar import InverseRadar
 from torchsar.reproduce.isal_rotation.common import focused, in_metres, known_of, ladar, second_order

@@ -34,7 +34,8 @@ from torchsar import plot
 from torchsar.compensate import EntropyObjective, ImageEntropy, genetic_rotation, uneven_rotation
 from torchsar.core import Draws, Estimate, Signal, Truth
 from torchsar.echo import simulate_turntable
-from torchsar.focus import MatchedFourier, mean_rate
+from torchsar.focus import MatchedFourier
+from torchsar.focus.image_lines import mean_rate
 from torchsar.metrics import entropy, impulse_response, rotation_bounds
 from torchsar.radar import InverseRadar
 from torchsar.reproduce.isal_rotation.common import focused, in_metres, known_of, ladar

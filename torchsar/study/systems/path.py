@@ -18,10 +18,8 @@ from torchsar.core import Chain, Draws, Recording, Signal, Trace, per_trial
 from torchsar.echo import Impairment, simulate_path
 from torchsar.echo.path import nominal_geometry
 from torchsar.focus import MotionCompensation, OmegaKImage, PathImage, TilePlan, backproject
-from torchsar.focus.ladar_requirements import Limit
-from torchsar.focus.motion_compensation import possible_compensations
-from torchsar.focus.path_image import last_image, seen_in
-from torchsar.focus.tiles.plan import possible_tiles
+from torchsar.focus.path_image import last_image, possible_plans, seen_in
+from torchsar.focus.requirements import Limit
 from torchsar.io import read_history
 from torchsar.metrics import (
     contrast,
@@ -410,8 +408,8 @@ class AnyPath(System):
         antennas, grid = AntennaPath.recorded(clean.aux), stage.grid
         geometry = (clean.aux["frequency_hz"], antennas.transmitter_m, antennas.receiver_m, antennas.reference_m)
         # tiles sum the pulses of the recommended method
-        errors_db = (-20.0, -40.0, -60.0, -80.0)
-        tiles = possible_tiles(errors_db, *geometry, grid, lit=stage.lit(antennas), weight=stage.weight(antennas))
+        seen = stage.lit(antennas), stage.weight(antennas)
+        tiles = possible_plans(lambda error: TilePlan(*geometry, grid, error, *seen), (-20.0, -40.0, -60.0, -80.0))
         alternatives = [
             Alternative(
                 f"tiles at {error:g} dB",
@@ -425,7 +423,9 @@ class AnyPath(System):
         lit = None if bench.recording is not None else bench.world().beam
         images = (s for c in bench.chains.values() for s in c.stages.values() if isinstance(s, OmegaKImage))
         beams = [image.beam for image in images if image.beam is not None]
-        straight = {} if not beams else possible_compensations(geometry[0], antennas, grid, beams[0])
+        straight = possible_plans(
+            lambda order: MotionCompensation(geometry[0], antennas, grid, beams[0], order), (1, 2) if beams else ()
+        )
         compensated = [
             Alternative(
                 f"omega-K after motion compensation of order {order}",

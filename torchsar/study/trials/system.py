@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Recording, Signal, Trace
-from torchsar.focus.ladar_requirements import Limit
-from torchsar.focus.requirements import Requirement
+from torchsar.focus.requirements import Limit, Requirement
 from torchsar.study.names.registry import stages
 from torchsar.study.output.pictures import Drawn, comparisons
 from torchsar.study.settings.cases import ALL, titled, word_of

@@ -13,8 +13,7 @@ from torch import Tensor
 
 from torchsar.core import Alternate, Chain, Draws, Signal
 from torchsar.echo import bistatic_echo
-from torchsar.focus.ladar_requirements import Limit
-from torchsar.focus.requirements import Requirement
+from torchsar.focus.requirements import Limit, Requirement
 from torchsar.metrics import error_db
 from torchsar.metrics.replicas import azimuth_response
 from torchsar.multichannel import (

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from torchsar.core import Draws, Signal
 from torchsar.echo import bistatic_echo
-from torchsar.focus.ladar_requirements import Limit
-from torchsar.focus.requirements import Requirement
+from torchsar.focus.requirements import Limit, Requirement
 from torchsar.metrics import error_db
 from torchsar.multichannel import (
     ImageMovers,

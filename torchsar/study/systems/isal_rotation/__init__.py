@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Trace
-from torchsar.focus.ladar_requirements import Limit
 from torchsar.focus.matched_fourier import MatchedFourier
+from torchsar.focus.requirements import Limit
 from torchsar.metrics import contrast, entropy, rotation_bounds
 from torchsar.radar import InverseRadar
 from torchsar.scene import Points, PolynomialRotation, Scatterers, Scene, Together, TurntableWorld

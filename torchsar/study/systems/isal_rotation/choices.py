@@ -15,8 +15,7 @@ from torchsar.compensate.rotation import coarse_rotation, phase_fit_rotation, un
 from torchsar.compensate.rotation.entropy_search import descent_near_truth, genetic_near_truth
 from torchsar.core import Draws, Estimate
 from torchsar.focus import DopplerLines, ExplicitSum, Gridding, Resampling, matched_fourier, range_phase
-from torchsar.focus.ladar_requirements import Limit
-from torchsar.focus.requirements import Requirement
+from torchsar.focus.requirements import Limit, Requirement
 from torchsar.focus.rotation_requirements import (
     order_loss_db,
     range_term_loss_db,

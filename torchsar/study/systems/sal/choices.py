@@ -16,8 +16,8 @@ from torchsar.compensate.radial.measured import Intercept
 from torchsar.core import Draws, Estimate
 from torchsar.echo import range_model_error_db
 from torchsar.focus import AzimuthMatchedFilter
-from torchsar.focus.ladar_requirements import Limit, ladar_limits, ladar_requirements
-from torchsar.focus.requirements import Requirement
+from torchsar.focus.ladar_requirements import ladar_limits, ladar_requirements
+from torchsar.focus.requirements import Limit, Requirement
 from torchsar.metrics import error_after_gain_db
 from torchsar.scene import drawn_motion
 from torchsar.scene.moved_scene import Moved

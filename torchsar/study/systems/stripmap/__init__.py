@@ -14,10 +14,8 @@ from torch import Tensor
 from torchsar.core import Chain, Draws, Signal, Trace, Truth, wrapped
 from torchsar.echo import Impairment, apply_impairments, simulate, target_energy
 from torchsar.focus import ClosestRange
-from torchsar.focus.ladar_requirements import Limit
-from torchsar.focus.requirements import Requirement
+from torchsar.focus.requirements import Limit, Requirement, strip_limits
 from torchsar.focus.skew import common_lines
-from torchsar.focus.strip_limits import strip_limits
 from torchsar.io import read_stripmap
 from torchsar.metrics import contrast, correlation, entropy, error_db, impulse_response
 from torchsar.metrics.bounds import reference_doppler_std_hz, tone_frequency_bound_hz, velocity_bound_m_s

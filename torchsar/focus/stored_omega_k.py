@@ -1,4 +1,4 @@
-"""Omega-K without Stolt interpolation as an invertible operator between raw lines and image.
+"""Omega-K without Stolt interpolation with stored filters: a stage and an invertible operator.
 
 For the whole PRF, every filter of `omega_k` has unit modulus, except the filter of range
 compression. If this filter also has unit modulus (`all_pass`), the operator is unitary: its inverse
@@ -8,11 +8,14 @@ that compute the echoes of a modelled image.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
-from torchsar.core import checked_samples, outer_phasor, phasor_tables
-from torchsar.focus.omega_k import FrameGeometry, FrequencyBasis, bulk_filter, refocus_turns_per_sample
+from torchsar.core import Axis, Signal, Stage, outer_phasor, phasor_tables
+from torchsar.focus.frame_geometry import FrameGeometry
+from torchsar.focus.omega_k import FrequencyBasis, OmegaK, bulk_filter, refocus_turns_per_sample, through_doppler
 from torchsar.radar import StripmapRadar
 
 
@@ -48,6 +51,9 @@ class InvertibleOmegaK:
             centroid where the radar has none.
         reference: Spectrum of the range compression filter, shape (range,); None for
             range-compressed data.
+        band_hz: Processed Doppler bandwidth about the centroid in Hz; None for the whole PRF, for
+            which alone the adjoint can be the inverse.
+        device: Device of the filters; None for that of the data.
 
     Raises:
         ValueError: If `doppler_hz` or `velocity_m_s` is neither a number nor a tensor in the shape
@@ -64,12 +70,16 @@ class InvertibleOmegaK:
         velocity_m_s: Tensor | float | None = None,
         frame_hz: Tensor | float | None = None,
         reference: Tensor | None = None,
+        band_hz: float | None = None,
+        device: torch.device | None = None,
     ) -> None:
-        at = FrameGeometry.of(radar, like, doppler_hz, velocity_m_s, frame_hz)
+        device = like.device if device is None else device
+        at = FrameGeometry.of(radar, like, doppler_hz, velocity_m_s, frame_hz, device, band_hz)
         n, self.n = like.shape[-1], like.shape[-1]
         centre = n // 2
         range_m = radar.near_range_m + centre * radar.range_step_m
-        self.bulk = bulk_filter(FrequencyBasis(radar, n, like.device, at.sin_reach), at, range_m, reference, like.dtype)
+        basis = FrequencyBasis(radar, n, device, at.sin_reach)
+        self.bulk = at.weighted(bulk_filter(basis, at, range_m, reference, like.dtype))
         self.fine, self.coarse = phasor_tables(refocus_turns_per_sample(at), -centre, n, like.dtype)
 
     def compress(self, spectra: Tensor, rows: slice = slice(None)) -> Tensor:
@@ -127,43 +137,60 @@ class InvertibleOmegaK:
         return torch.fft.ifft2(self.expand(torch.fft.fft(image, dim=-2)))
 
 
-def defocus_omega_k(
-    image: Tensor,
-    radar: StripmapRadar,
-    *,
-    doppler_hz: Tensor | float,
-    velocity_m_s: Tensor | float | None = None,
-    frame_hz: Tensor | float | None = None,
-    reference: Tensor | None = None,
-) -> Tensor:
-    """Compute the raw lines of an image by the adjoint of `omega_k`.
+class StoredOmegaK(Stage):
+    """Stage that focuses many recordings of one geometry with filters built once.
 
-    The adjoint is the exact inverse where `reference` has unit modulus or is None.
+    The stored filters take one complex number per sample of the raw matrix.
 
     Args:
-        image: Image, shape (..., azimuth, range), complex.
-        radar: Radar of the recording.
-        doppler_hz: Absolute Doppler centroid in Hz, a number or shape (...,).
-        velocity_m_s: Effective velocity in m/s, a number or shape (...,); None for that of the
-            radar.
-        frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates, 0
-            for a zero-Doppler image; None for the nominal pointing of the radar, or for the
-            centroid where the radar has none.
-        reference: Spectrum of the range compression filter, shape (range,); None for
-            range-compressed data.
-
-    Returns:
-        Raw lines, same shape.
-
-    Raises:
-        TypeError: If the samples are not complex64 or complex128.
-        ValueError: If there are no samples, or if `doppler_hz` or `velocity_m_s` is neither a
-            number nor a tensor in the shape of the leading dims of the image, the velocity is not
-            positive, or the magnitude of `doppler_hz` or `frame_hz` is not below 2 velocity /
-            wavelength.
+        stage: Stage whose radar, reference, velocity and Doppler are used.
+        axes: Axes of the raw matrix, ending in (pulse, range).
+        dtype: Complex type of the data.
     """
-    image = checked_samples(image, "defocus_omega_k", "azimuth, range", finite=False)
-    operator = InvertibleOmegaK(
-        radar, image, doppler_hz=doppler_hz, velocity_m_s=velocity_m_s, frame_hz=frame_hz, reference=reference
-    )
-    return operator.defocus(image)
+
+    bulk: Tensor
+    fine: Tensor
+    coarse: Tensor
+
+    def __init__(self, stage: OmegaK, axes: tuple[Axis, ...], dtype: torch.dtype = torch.complex64) -> None:
+        super().__init__()
+        self.axes, self.radar = axes, replace(stage.radar, near_range_m=axes[-1].start)
+        device = stage.velocity_m_s.device
+        with torch.no_grad():
+            operator = InvertibleOmegaK(
+                self.radar,
+                torch.empty((axes[-2].n, axes[-1].n), dtype=dtype, device="meta"),
+                doppler_hz=stage.doppler_hz,
+                velocity_m_s=stage.velocity_m_s,
+                frame_hz=stage.frame_hz,
+                reference=stage.spectrum(axes[-1].n, device),
+                band_hz=stage.band_hz,
+                device=device,
+            )
+        for name in ("bulk", "fine", "coarse"):
+            self.register_buffer(name, getattr(operator, name))
+
+    def forward(self, signal: Signal) -> Signal:
+        """Focus a recording whose axes and dtype are those that the filters were built for.
+
+        Args:
+            signal: Recording with axes (pulse, range).
+
+        Returns:
+            Image with axes (azimuth, range).
+
+        Raises:
+            ValueError: If axes or dtype are not those that the filters were built for.
+        """
+        if signal.axes != self.axes or signal.data.dtype != self.bulk.dtype:
+            raise ValueError(
+                f"the signal must have the axes {self.axes} and the dtype {self.bulk.dtype} that the filters of "
+                f"this StoredOmegaK were built for, got {signal.axes} and {signal.data.dtype}; build a new one"
+            )
+
+        def focus_rows(rows: Tensor, part: slice) -> Tensor:
+            lines = torch.fft.ifft(rows * self.bulk[..., part, :])
+            return lines * outer_phasor(self.fine[..., part, :], self.coarse[..., part, :], lines.shape[-1])
+
+        data = through_doppler(signal.data, focus_rows, differentiable=signal.data.requires_grad)
+        return Signal(data, self.radar.image_axes(signal.axes))
