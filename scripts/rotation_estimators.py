@@ -30,12 +30,7 @@ from torchsar.compensate import (
     EntropyObjective,
     ImageEntropy,
     coarse_rotation,
-    descend_rotation,
-    evolve_rotation,
-    genetic_rotation,
-    newton_rotation,
-    phase_fit_rotation,
-    search_rotation,
+    entropy_rotation,
     uneven_rotation,
 )
 from torchsar.core import Draws, Estimate, Signal
@@ -130,7 +125,7 @@ def without_box(bench: Bench, rounds: int) -> None:
     process is slower.
     """
     bench.add("coarse", lambda: coarse_rotation(bench.signal.data, **bench.known), rounds)
-    bench.add("coarse + phase fit", lambda: phase_fit_rotation(bench.signal.data, **bench.known), rounds)
+    bench.add("coarse + phase fit", lambda: coarse_rotation(bench.signal.data, **bench.known, fits=4), rounds)
     bench.add("recommended", lambda: uneven_rotation(bench.signal.data, **bench.known), rounds)
 
 
@@ -144,8 +139,8 @@ def from_starts(bench: Bench, steps: int, forms: tuple[str, ...], oversamplings:
             figure = bench.figure(2.0, variables)
             bench.add(
                 name,
-                lambda f=figure, x=factor, d=damped: newton_rotation(
-                    f, f.start(x * TRUTH[0], x * TRUTH[1:]), damped=d, steps=steps
+                lambda f=figure, x=factor, d=damped: entropy_rotation(
+                    f, "newton", f.start(x * TRUTH[0], x * TRUTH[1:]), damped=d, steps=steps
                 ),
             )
     for oversampling in oversamplings:
@@ -153,7 +148,7 @@ def from_starts(bench: Bench, steps: int, forms: tuple[str, ...], oversamplings:
             figure = bench.figure(oversampling, "shape")
             bench.add(
                 f"quasi-Newton x{factor:g} shape, os {oversampling:g}",
-                lambda f=figure, x=factor: descend_rotation(f, f.start(x * TRUTH[0], x * TRUTH[1:])),
+                lambda f=figure, x=factor: entropy_rotation(f, "descent", f.start(x * TRUTH[0], x * TRUTH[1:])),
             )
 
 
@@ -167,15 +162,17 @@ def in_box(bench: Bench, seeds: int, generations: tuple[int, int, int]) -> None:
         for seed in range(1, seeds + 1):
             bench.add(
                 f"GA 6 x {few}, os {oversampling:g}, seed {seed}",
-                lambda f=figure, s=seed: genetic_rotation(f, LOW, HIGH, draws=Draws(s), population=6, generations=few),
+                lambda f=figure, s=seed: entropy_rotation(
+                    f, "genetic", (LOW, HIGH), draws=Draws(s), population=6, generations=few
+                ),
             )
         bench.add(
             f"GA 30 x {many}, os {oversampling:g}",
-            lambda f=figure: genetic_rotation(f, LOW, HIGH, draws=Draws(1), generations=many),
+            lambda f=figure: entropy_rotation(f, "genetic", (LOW, HIGH), draws=Draws(1), generations=many),
         )
     bench.add(
         f"differential evolution 24 x {evolved}",
-        lambda: evolve_rotation(bench.figure(2.0), LOW, HIGH, draws=Draws(1), generations=evolved),
+        lambda: entropy_rotation(bench.figure(2.0), "evolution", (LOW, HIGH), draws=Draws(1), generations=evolved),
     )
 
 
@@ -189,7 +186,7 @@ def on_grid(bench: Bench, counts: tuple[int, ...]) -> float:
         for low, high, n in zip(LOW, HIGH, counts, strict=True)
     ]
     name = f"grid {' x '.join(map(str, counts))}"
-    bench.add(name, lambda: search_rotation(bench.figure(2.0), axes))
+    bench.add(name, lambda: entropy_rotation(bench.figure(2.0), "grid", axes))
     whole = bench.runs[name].seconds * math.prod(GRID) / math.prod(counts)
     print(
         f"{f'grid {GRID[0]} x {GRID[1]} x {GRID[2]}, extrapolated':34}{math.prod(GRID):>8}"

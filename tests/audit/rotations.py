@@ -16,13 +16,8 @@ from torchsar.compensate import (
     CoarseRotation,
     CorrectPulsePhase,
     EntropyObjective,
-    PhaseFitRotation,
+    EntropyRotation,
     RotationAutofocus,
-    RotationDescent,
-    RotationEvolution,
-    RotationGenetic,
-    RotationNewton,
-    RotationSearch,
     UnevenRotation,
 )
 from torchsar.core import Alternate, Draws, Signal, Turn
@@ -166,21 +161,23 @@ def entries() -> list[Entry]:
     start = [9.0, 900.0]
     searches = {
         # with points of the grid near the truth, but not at it
-        "RotationSearch": RotationSearch(RADAR, [8.0, 800.0], [12.2, 1220.0], [8, 8], objective=ORDER),
-        "RotationGenetic": RotationGenetic(RADAR, *box, **small),
-        "RotationEvolution": RotationEvolution(RADAR, *box, **small),
-        "RotationNewton": RotationNewton(RADAR, start, objective=replace(ORDER, taps=6)),
-        "RotationDescent": RotationDescent(RADAR, start, objective=shape),
+        "EntropyRotation": EntropyRotation(RADAR, "grid", [8.0, 800.0], [12.2, 1220.0], [8, 8], objective=ORDER),
+        "EntropyRotation:genetic": EntropyRotation(RADAR, "genetic", *box, **small),
+        "EntropyRotation:evolution": EntropyRotation(RADAR, "evolution", *box, **small),
+        "EntropyRotation:newton": EntropyRotation(RADAR, "newton", start=start, objective=replace(ORDER, taps=6)),
+        "EntropyRotation:descent": EntropyRotation(RADAR, "descent", start=start, objective=shape),
     }
-    far = RotationSearch(RADAR, [2.0, 200.0], [20.0, 2000.0], [7, 7], objective=ORDER)  # no point of the grid is of use
+    far = EntropyRotation(
+        RADAR, "grid", [2.0, 200.0], [20.0, 2000.0], [7, 7], objective=ORDER
+    )  # no point of the grid is of use
     phase = Turn(RotationAutofocus(RADAR), CorrectPulsePhase())
-    pair = Alternate(3, phase=phase, rotation=Turn(PhaseFitRotation(RADAR, yc_m=0.0)))
+    pair = Alternate(3, phase=phase, rotation=Turn(CoarseRotation(RADAR, yc_m=0.0, fits=4)))
     return [
         Entry("compensate.UnevenRotation", UnevenRotation(RADAR), WORLDS, [*PARTS, *WARP, *RATE]),
         Entry("compensate.CoarseRotation", CoarseRotation(RADAR), WORLDS, WARP),
-        Entry("compensate.PhaseFitRotation", PhaseFitRotation(RADAR), WORLDS, WARP),
+        Entry("compensate.CoarseRotation:fits", CoarseRotation(RADAR, fits=4), WORLDS, WARP),
         *(Entry(f"compensate.{name}", stage, WORLDS, WARP) for name, stage in searches.items()),
-        Entry("compensate.RotationSearch:far", far, [world for world in WORLDS if world.name == "direct"], WARP),
+        Entry("compensate.EntropyRotation:far", far, [world for world in WORLDS if world.name == "direct"], WARP),
         Entry("compensate.RotationAutofocus", RotationAutofocus(RADAR), PHASE_WORLDS, PHASES_OF_WARP),
         Entry("core.Alternate", lambda x, **_: pair(x), PHASE_WORLDS, [*PHASES_OF_WARP, *WARP]),
     ]

@@ -85,7 +85,7 @@ CELLS = [
     ("compensate.PhasePolish", "own", 20.0, 1.0),
     ("compensate.Sca", "few points", 10.0, 0.0),
     ("compensate.CoarseRotation", "direct", 0.0, 0.8),
-    ("compensate.RotationDescent", "direct", 0.0, 0.8),
+    ("compensate.EntropyRotation:descent", "direct", 0.0, 0.8),
     ("compensate.EntropyFixedPoint", "partly lit", 10.0, 0.0),
     ("compensate.Autofocus", "one point", -5.0, 1.0),
     ("compensate.LinkPhases", "another scene of 8 points", 20.0, 0.0),

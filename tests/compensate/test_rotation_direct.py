@@ -14,12 +14,11 @@ from torchsar.compensate import (
     EntropyObjective,
     ImageEntropy,
     coarse_rotation,
-    evolve_rotation,
-    genetic_rotation,
-    phase_fit_rotation,
-    rotating_autofocus,
+    entropy_rotation,
+    rotation_autofocus,
     uneven_rotation,
 )
+from torchsar.compensate.rotation.entropy_search import Method
 from torchsar.core import Draws, Estimate
 from torchsar.metrics import rotation_bounds
 
@@ -71,19 +70,19 @@ def test_what_is_left_of_scatterers_before_the_fit_converges_is_no_noise() -> No
     assert over_db.abs().max() < 2
 
 
-def searched(data: Tensor, name: str) -> Estimate:
+def searched(data: Tensor, name: Method) -> Estimate:
     entropy = ImageEntropy(data, EntropyObjective(oversampling=1.0), **OPTIONS)
-    search = {"genetic": genetic_rotation, "evolution": evolve_rotation}[name]
-    return search(entropy, [0.018, 9.0, 900.0], [0.022, 11.0, 1100.0], draws=Draws(1), population=8, generations=6)
+    box = ([0.018, 9.0, 900.0], [0.022, 11.0, 1100.0])
+    return entropy_rotation(entropy, name, box, draws=Draws(1), population=8, generations=6)
 
 
 ESTIMATORS = {
     "coarse": lambda data: coarse_rotation(data, **OPTIONS),
-    "phase fit": lambda data: phase_fit_rotation(data, **OPTIONS),
+    "phase fit": lambda data: coarse_rotation(data, **OPTIONS, fits=4),
     "recommended": lambda data: uneven_rotation(data, **OPTIONS),
     "genetic": lambda data: searched(data, "genetic"),
     "evolution": lambda data: searched(data, "evolution"),
-    "autofocus": lambda data: rotating_autofocus(data, PRF, K.expand(len(data), -1)),
+    "autofocus": lambda data: rotation_autofocus(data, PRF, K.expand(len(data), -1)),
 }
 
 
@@ -97,8 +96,8 @@ def test_a_target_lit_for_half_of_the_aperture_is_not_ok() -> None:
     """Its rotation in the other half would be extrapolated."""
     clean = TINY.echo(*TINY.satellite(3)) * (torch.arange(TINY.pulses) < TINY.pulses // 2)[:, None]
     data, _ = TINY.noisy(clean, 10.0, 5)
-    for estimator in (coarse_rotation, phase_fit_rotation):
-        found = estimator(data, **TINY.options)
+    for fits in (0, 4):
+        found = coarse_rotation(data, **TINY.options, fits=fits)
         assert not found.ok and math.isinf(found.info["phase_error_rad"])
 
 

@@ -11,19 +11,12 @@ from torch import Tensor
 
 from torchsar.compensate import (
     EntropyObjective,
+    EntropyRotation,
     ImageEntropy,
-    RotationDescent,
-    RotationEvolution,
-    RotationGenetic,
-    RotationNewton,
-    RotationSearch,
-    descend_rotation,
-    evolve_rotation,
-    genetic_rotation,
-    newton_rotation,
-    search_rotation,
+    entropy_rotation,
 )
-from torchsar.compensate.rotation import Unknowns, entropy_search
+from torchsar.compensate.rotation import entropy_search
+from torchsar.compensate.rotation.image_entropy import Unknowns
 from torchsar.core import Chain, Draws, Estimate, Outcome, Signal, use
 from torchsar.metrics import entropy
 from torchsar.radar import LIGHT_M_S, InverseRadar
@@ -157,8 +150,8 @@ def test_no_compensation_is_uniform_rotation_without_range_phase() -> None:
 def test_descents_from_any_start_reach_one_minimum(variables, factor: float) -> None:
     of = figure(target(), variables=variables)
     start = of.start(factor * OMEGA, factor * K)
-    descent, newton = descend_rotation(of, start), newton_rotation(of, start)
-    best = newton_rotation(figure(target()), TRUTH, steps=40).info["entropy_nats"]
+    descent, newton = entropy_rotation(of, "descent", start), entropy_rotation(of, "newton", start)
+    best = entropy_rotation(figure(target()), "newton", TRUTH, steps=40).info["entropy_nats"]
     for found in (descent, newton):
         assert found.ok
         torch.testing.assert_close(found.info["entropy_nats"], best, atol=1e-5, rtol=0)
@@ -170,37 +163,40 @@ def test_descents_from_any_start_reach_one_minimum(variables, factor: float) -> 
 def test_undamped_newton_diverges_and_is_not_ok() -> None:
     of = figure(target())
     for factor in (0.9, 1.1):
-        found = newton_rotation(of, of.start(factor * OMEGA, factor * K), damped=False)
+        found = entropy_rotation(of, "newton", of.start(factor * OMEGA, factor * K), damped=False)
         assert not found.ok
         assert all(torch.isfinite(value).all() for value in found.value.values())
-        assert newton_rotation(of, of.start(factor * OMEGA, factor * K)).ok
+        assert entropy_rotation(of, "newton", of.start(factor * OMEGA, factor * K)).ok
 
 
 def test_population_searches_find_the_minimum_inside_their_box() -> None:
     of = figure(target(), oversampling=2.0, taps=4, lines=600)
-    best = descend_rotation(of, of.start(OMEGA, K)).info["entropy_nats"]
+    best = entropy_rotation(of, "descent", of.start(OMEGA, K)).info["entropy_nats"]
     low, high = 0.7 * TRUTH, 1.3 * TRUTH
-    for found in (genetic_rotation(of, low, high, draws=Draws(1)), evolve_rotation(of, low, high, draws=Draws(1))):
+    for found in (
+        entropy_rotation(of, "genetic", (low, high), draws=Draws(1)),
+        entropy_rotation(of, "evolution", (low, high), draws=Draws(1)),
+    ):
         assert found.ok and abs(float(found.info["entropy_nats"] - best)) < 0.02
     assert found.info["evaluations"] == 888 and found.info["best_entropy_nats"].shape == (37,)
-    outside = evolve_rotation(of, 1.1 * TRUTH, 1.3 * TRUTH, draws=Draws(1), generations=8)
+    outside = entropy_rotation(of, "evolution", (1.1 * TRUTH, 1.3 * TRUTH), draws=Draws(1), generations=8)
     assert not outside.ok and outside.info["on_edge"].any(), "the minimum lies outside this box"
 
 
 def test_the_grid_search_returns_the_entropy_on_the_grid() -> None:
     of = figure(target(), oversampling=2.0, taps=4)
     axes = [[OMEGA], [9.0, 9.5, 10.0, 10.5, 11.0], [900.0, 1000.0, 1100.0]]
-    found = search_rotation(of, axes)
+    found = entropy_rotation(of, "grid", axes)
     assert found.ok and found.info["evaluations"] == 15 and found.info["entropy_grid_nats"].shape == (1, 5, 3)
     torch.testing.assert_close(found["warp_k"], K, atol=0, rtol=0)
-    edge = search_rotation(of, [[OMEGA], [5.0, 10.0], [1000.0]])
+    edge = entropy_rotation(of, "grid", [[OMEGA], [5.0, 10.0], [1000.0]])
     assert edge.outcome == Outcome.OUTSIDE_SEARCH and edge.info["on_edge"].tolist() == [False, True, False]
 
 
 def test_the_centre_deviation_is_found_jointly() -> None:
     data = target(yc_m=1.5)
     ignored, known, joint = (
-        descend_rotation(of, of.start(OMEGA, K))
+        entropy_rotation(of, "descent", of.start(OMEGA, K))
         for of in (figure(data, variables="shape", yc_m=yc) for yc in (0.0, 1.5, None))
     )
     assert joint.info["entropy_nats"] < ignored.info["entropy_nats"] - 5e-3
@@ -225,8 +221,8 @@ def test_second_order_finds_the_middle_rate() -> None:
     of = ImageEntropy(
         data, EntropyObjective(order=2, range_term=False), wavelength_m=WAVELENGTH, prf_hz=1e6, range_m=one
     )
-    coarse = search_rotation(of, [torch.linspace(0, 40, 41, dtype=F64)])
-    found = descend_rotation(of, of.start(0.0, coarse["warp_k"]))
+    coarse = entropy_rotation(of, "grid", [torch.linspace(0, 40, 41, dtype=F64)])
+    found = entropy_rotation(of, "descent", of.start(0.0, coarse["warp_k"]))
     assert not found.ok and abs(float(found["k1_per_s"]) - 20) < 0.6
     assert set(found.value) == {"warp_k", "k1_per_s"}
 
@@ -234,7 +230,7 @@ def test_second_order_finds_the_middle_rate() -> None:
 def test_uniform_rotation_is_not_improved() -> None:
     still = target(k=torch.zeros(2, dtype=F64))
     of = figure(still, range_term=False, oversampling=2.0)
-    found = descend_rotation(of, of.start(0.0, torch.zeros(2, dtype=F64)))
+    found = entropy_rotation(of, "descent", of.start(0.0, torch.zeros(2, dtype=F64)))
     assert found.quality < 0.02
     assert abs(float(found["k1_per_s"])) < 3, "24 points shift the minimum by less than this"
 
@@ -242,14 +238,14 @@ def test_uniform_rotation_is_not_improved() -> None:
 def test_a_batch_equals_single_trials() -> None:
     data = torch.stack([target(0), 100 * target(1), target(2, k=torch.tensor([20.0, -500.0], dtype=F64))])
     kinds = {
-        "descent": lambda of: descend_rotation(of, of.start(OMEGA, 0.95 * K), steps=5),
-        "newton": lambda of: newton_rotation(of, of.start(OMEGA, 0.95 * K), steps=3),
-        "grid": lambda of: search_rotation(of, [[OMEGA], [9.0, 10.0, 11.0], [900.0, 1000.0, 1100.0]]),
-        "genetic": lambda of: genetic_rotation(
-            of, 0.9 * TRUTH, 1.1 * TRUTH, draws=Draws(2), population=6, generations=2
+        "descent": lambda of: entropy_rotation(of, "descent", of.start(OMEGA, 0.95 * K), steps=5),
+        "newton": lambda of: entropy_rotation(of, "newton", of.start(OMEGA, 0.95 * K), steps=3),
+        "grid": lambda of: entropy_rotation(of, "grid", [[OMEGA], [9.0, 10.0, 11.0], [900.0, 1000.0, 1100.0]]),
+        "genetic": lambda of: entropy_rotation(
+            of, "genetic", (0.9 * TRUTH, 1.1 * TRUTH), draws=Draws(2), population=6, generations=2
         ),
-        "evolution": lambda of: evolve_rotation(
-            of, 0.9 * TRUTH, 1.1 * TRUTH, draws=Draws(2), population=6, generations=2
+        "evolution": lambda of: entropy_rotation(
+            of, "evolution", (0.9 * TRUTH, 1.1 * TRUTH), draws=Draws(2), population=6, generations=2
         ),
     }
     for name, search in kinds.items():
@@ -264,15 +260,15 @@ def stages() -> list:
     low, high = (0.9 * TRUTH).tolist(), (1.1 * TRUTH).tolist()
     start = (0.95 * TRUTH).tolist()
     return [
-        RotationSearch(RADAR, low, high, [3, 3, 3]),
-        RotationGenetic(RADAR, low, high, population=10, generations=4),
-        RotationEvolution(RADAR, low, high, population=10, generations=4),
-        RotationNewton(RADAR, start, steps=10),
-        RotationDescent(RADAR, start),
+        EntropyRotation(RADAR, "grid", low, high, [3, 3, 3]),
+        EntropyRotation(RADAR, "genetic", low, high, population=10, generations=4),
+        EntropyRotation(RADAR, "evolution", low, high, population=10, generations=4),
+        EntropyRotation(RADAR, "newton", start=start, steps=10),
+        EntropyRotation(RADAR, "descent", start=start),
     ]
 
 
-@pytest.mark.parametrize("stage", stages(), ids=lambda stage: type(stage).__name__)
+@pytest.mark.parametrize("stage", stages(), ids=lambda stage: stage.method)
 @pytest.mark.parametrize("dtype", [torch.complex64, torch.complex128])
 def test_stages_provide_what_they_declare(stage, dtype: torch.dtype) -> None:
     found = stage(signal_of(torch.stack([target(0), target(1)]).to(dtype)))
@@ -285,11 +281,11 @@ def test_stages_provide_what_they_declare(stage, dtype: torch.dtype) -> None:
 
 def test_a_descent_starts_from_the_result_of_a_search() -> None:
     chain = Chain(
-        coarse=RotationSearch(
-            RADAR, [OMEGA, 8.0, 800.0], [OMEGA, 12.0, 1200.0], [1, 5, 5], EntropyObjective(oversampling=1.0)
+        coarse=EntropyRotation(
+            RADAR, "grid", [OMEGA, 8.0, 800.0], [OMEGA, 12.0, 1200.0], [1, 5, 5], EntropyObjective(oversampling=1.0)
         ),
         fine=use(
-            RotationDescent(RADAR, objective=EntropyObjective(variables="shape", oversampling=4.0)),
+            EntropyRotation(RADAR, "descent", objective=EntropyObjective(variables="shape", oversampling=4.0)),
             omega_rad_s="coarse",
             warp_k="coarse",
             yc_m="coarse",
@@ -318,17 +314,17 @@ def test_invalid_input_is_rejected() -> None:
     with pytest.raises(ValueError, match="'raw' or 'shape'"):
         figure(data, variables="polar")
     with pytest.raises(ValueError, match="low must hold the 3 values omega_rad_s, k1_per_s, k2_per_s2, got 2"):
-        genetic_rotation(figure(data), [0.01, 9.0], [0.03, 11.0], draws=Draws(1))
+        entropy_rotation(figure(data), "genetic", ([0.01, 9.0], [0.03, 11.0]), draws=Draws(1))
     with pytest.raises(ValueError, match="list of values for each of the 3 unknowns"):
-        search_rotation(figure(data), [[0.02], [10.0]])
+        entropy_rotation(figure(data), "grid", [[0.02], [10.0]])
     with pytest.raises(ValueError, match="27000 evaluations per trial, above the limit of 1000"):
-        search_rotation(figure(data), [torch.linspace(1, 2, 30, dtype=F64)] * 3, limit=1000)
-    with pytest.raises(ValueError, match="RotationDescent needs a rotation to start from"):
-        RotationDescent(RADAR)(signal_of(data))
+        entropy_rotation(figure(data), "grid", [torch.linspace(1, 2, 30, dtype=F64)] * 3, limit=1000)
+    with pytest.raises(ValueError, match="EntropyRotation needs a rotation to start from"):
+        EntropyRotation(RADAR, "descent")(signal_of(data))
     with pytest.raises(ValueError, match="start must hold the 3 values omega, k1, k2"):
-        RotationNewton(RADAR, [10.0, 1000.0])
+        EntropyRotation(RADAR, "newton", start=[10.0, 1000.0])
     with pytest.raises(ValueError, match="low, high and counts must hold one entry per unknown"):
-        RotationSearch(RADAR, [0.0], [1.0, 2.0], [3])
+        EntropyRotation(RADAR, "grid", [0.0], [1.0, 2.0], [3])
 
 
 @pytest.mark.parametrize("order", [1, 2, 3, 4, 5])
@@ -351,7 +347,9 @@ def test_sequences_are_accepted_as_vectors() -> None:
 def test_a_search_that_uses_up_its_steps_is_not_ok() -> None:
     of = figure(target(), variables="shape")
     start = of.start(0.9 * OMEGA, 0.9 * K)
-    assert not descend_rotation(of, start, steps=2).ok and not newton_rotation(of, start, steps=2).ok
+    assert (
+        not entropy_rotation(of, "descent", start, steps=2).ok and not entropy_rotation(of, "newton", start, steps=2).ok
+    )
 
 
 def test_values_do_not_depend_on_the_assessment(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -363,11 +361,11 @@ def test_values_do_not_depend_on_the_assessment(monkeypatch: pytest.MonkeyPatch)
         start, box = of.start(OMEGA, 0.95 * K), (0.9 * TRUTH, 1.1 * TRUTH)
         few = {"population": 6, "generations": 2, "draws": Draws(2)}
         return [
-            search_rotation(of, axes, **options),
-            genetic_rotation(of, *box, **few, **options),
-            evolve_rotation(of, *box, **few, **options),
-            newton_rotation(of, start, steps=2, **options),
-            descend_rotation(of, start, steps=2, **options),
+            entropy_rotation(of, "grid", axes, **options),
+            entropy_rotation(of, "genetic", box, **few, **options),
+            entropy_rotation(of, "evolution", box, **few, **options),
+            entropy_rotation(of, "newton", start, steps=2, **options),
+            entropy_rotation(of, "descent", start, steps=2, **options),
         ]
 
     def failing(*_: object) -> None:

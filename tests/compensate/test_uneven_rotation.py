@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -29,13 +30,11 @@ from tests.compensate.turning import (
 from torchsar.compensate import (
     CoarseRotation,
     CorrectPulsePhase,
-    PhaseFitRotation,
     RotationAutofocus,
     UnevenRotation,
     autofocus,
     coarse_rotation,
-    phase_fit_rotation,
-    rotating_autofocus,
+    rotation_autofocus,
     uneven_rotation,
 )
 from torchsar.compensate.rotation import recommended
@@ -48,7 +47,7 @@ from torchsar.radar import LIGHT_M_S, InverseRadar
 from torchsar.radar.warp import least_rate, warp
 from torchsar.scene import PolynomialRotation, Satellite, TurntableWorld
 
-ESTIMATORS = {"coarse": coarse_rotation, "phase_fit": phase_fit_rotation, "uneven": uneven_rotation}
+ESTIMATORS = {"coarse": coarse_rotation, "phase_fit": partial(coarse_rotation, fits=4), "uneven": uneven_rotation}
 
 
 def z_scores(found: Estimate, k: Tensor, yc_m: float | None = 0.0) -> Tensor:
@@ -295,7 +294,7 @@ def signal_of(data: Tensor) -> Signal:
     [
         UnevenRotation(RADAR),
         CoarseRotation(RADAR),
-        PhaseFitRotation(RADAR),
+        CoarseRotation(RADAR, fits=4),
         UnevenRotation(RADAR, 4),
         UnevenRotation(RADAR, yc_m=0.5),
     ],
@@ -346,7 +345,7 @@ def test_the_autofocus_compensates_the_rotation() -> None:
     impaired = data * torch.exp(1j * walk)[:, None]
     phi = warp(torch.arange(PULSES, dtype=F64) / PRF, K)
     flat = impaired * torch.exp(-2j * math.pi / WAVELENGTH * RANGE_M * (OMEGA * phi[:, None]).square())
-    found = rotating_autofocus(flat, PRF, K[None])
+    found = rotation_autofocus(flat, PRF, K[None])
     assert found.ok and off_the_warp(found["phase_rad"] - walk, phi) < 0.1
     blind = RotationAutofocus(RADAR)(signal_of(impaired))
     assert off_the_warp(blind["phase_rad"] - walk, phi) > 0.3, "an autofocus without the rotation leaves a larger error"

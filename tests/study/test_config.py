@@ -242,7 +242,7 @@ def test_mistakes_are_named(tmp_path: Path, assignments: list[str], expected: li
             ["'aux.true_doppler_hz' is now called 'truth.doppler_hz'"],
         ),
         (
-            ["processor.recommended.stages.r={stage: rotation_descent, order: 2}"],
+            ["processor.recommended.stages.r={stage: rotation_entropy, method: descent, order: 2}"],
             ["'processor.recommended.stages.r.order' is now called 'objective.order'"],
         ),
         (["world.noise.order=2"], ["'world.noise.order' is not known"]),

@@ -147,7 +147,12 @@ MISTAKES = [
             "isal_rotation",
             odd={
                 "stages": {
-                    "rotation": {"stage": "rotation_genetic", "low": [0.018, 9.0], "high": [0.022, 11.0]},
+                    "rotation": {
+                        "stage": "rotation_entropy",
+                        "method": "genetic",
+                        "low": [0.018, 9.0],
+                        "high": [0.022, 11.0],
+                    },
                     "image": {"stage": "matched_fourier"},
                 }
             },

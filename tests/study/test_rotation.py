@@ -28,7 +28,10 @@ def outcomes_of(folder: Path, *overrides: str, trials: int = 2, **changes: objec
 
 
 def test_rotations_are_found_and_images_reach_the_ideal(tmp_path: Path) -> None:
-    genetic = {"rotation": {"stage": "rotation_genetic", **BOX, "population": 6, "generations": 3}, **FOUND_ROTATION}
+    genetic = {
+        "rotation": {"stage": "rotation_entropy", "method": "genetic", **BOX, "population": 6, "generations": 3},
+        **FOUND_ROTATION,
+    }
     processor = {**ISAL_ROTATION["processor"], "genetic": {"stages": genetic}}
     _, outcomes = outcomes_of(tmp_path, processor=processor)
     found = {n: {k: float(v.double().mean()) for k, v in o.metrics.items()} for n, o in outcomes.items()}

@@ -368,9 +368,9 @@ FUNCTIONS = [
     _entry("compensate.sharpest_phase", "raw", lambda x: compensate.sharpest_phase(x, steps=10), laws=RANGE_FREE),
     _entry("compensate.phase_polish", "raw", compensate.phase_polish, laws=RANGE_FREE),
     _entry(
-        "compensate.rotating_autofocus",
+        "compensate.rotation_autofocus",
         "raw",
-        lambda x: compensate.rotating_autofocus(
+        lambda x: compensate.rotation_autofocus(
             x, 400.0, torch.tensor([1.0, 5.0], dtype=F64).expand(math.prod(x.shape[:-2]), 2), search=4, polish=2
         ),
     ),
@@ -388,37 +388,39 @@ FUNCTIONS = [
     ),
     _entry("compensate.coarse_rotation", "raw", lambda x: compensate.coarse_rotation(x, range_m=cells(x), **OPTIONS)),
     _entry(
-        "compensate.phase_fit_rotation", "raw", lambda x: compensate.phase_fit_rotation(x, range_m=cells(x), **OPTIONS)
+        "compensate.coarse_rotation:fits",
+        "raw",
+        lambda x: compensate.coarse_rotation(x, range_m=cells(x), **OPTIONS, fits=4),
     ),
     _entry("compensate.uneven_rotation", "raw", lambda x: compensate.uneven_rotation(x, range_m=cells(x), **OPTIONS)),
     _entry(
-        "compensate.search_rotation",
+        "compensate.entropy_rotation",
         "raw",
-        lambda x: compensate.search_rotation(figure(x), [torch.tensor([0.1, 0.5]), torch.tensor([-2.0, 2.0])]),
+        lambda x: compensate.entropy_rotation(figure(x), "grid", [torch.tensor([0.1, 0.5]), torch.tensor([-2.0, 2.0])]),
     ),
     _entry(
-        "compensate.genetic_rotation",
+        "compensate.entropy_rotation:genetic",
         "raw",
-        lambda x: compensate.genetic_rotation(
-            figure(x), [0.1, -2.0], [0.5, 2.0], draws=Draws(1), population=6, generations=2
+        lambda x: compensate.entropy_rotation(
+            figure(x), "genetic", ([0.1, -2.0], [0.5, 2.0]), draws=Draws(1), population=6, generations=2
         ),
     ),
     _entry(
-        "compensate.evolve_rotation",
+        "compensate.entropy_rotation:evolution",
         "raw",
-        lambda x: compensate.evolve_rotation(
-            figure(x), [0.1, -2.0], [0.5, 2.0], draws=Draws(1), population=6, generations=2
+        lambda x: compensate.entropy_rotation(
+            figure(x), "evolution", ([0.1, -2.0], [0.5, 2.0]), draws=Draws(1), population=6, generations=2
         ),
     ),
     _entry(
-        "compensate.newton_rotation",
+        "compensate.entropy_rotation:newton",
         "raw",
-        lambda x: compensate.newton_rotation(figure(x), torch.tensor([0.3, 0.5], dtype=F64), steps=2),
+        lambda x: compensate.entropy_rotation(figure(x), "newton", torch.tensor([0.3, 0.5], dtype=F64), steps=2),
     ),
     _entry(
-        "compensate.descend_rotation",
+        "compensate.entropy_rotation:descent",
         "raw",
-        lambda x: compensate.descend_rotation(figure(x), torch.tensor([0.3, 0.5], dtype=F64), steps=2),
+        lambda x: compensate.entropy_rotation(figure(x), "descent", torch.tensor([0.3, 0.5], dtype=F64), steps=2),
     ),
     _entry(
         "compensate.compensate_motion",

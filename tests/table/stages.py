@@ -358,37 +358,39 @@ CASES = [
     Case("matched_fourier", lambda: focus.MatchedFourier(TURNTABLE), _warp, laws=Laws(pulse=NEW_AXIS)),
     Case(
         "rotation_search",
-        lambda: compensate.RotationSearch(TURNTABLE, [0.1, -2.0], [0.5, 2.0], [2, 3], objective=SEARCH),
+        lambda: compensate.EntropyRotation(TURNTABLE, "grid", [0.1, -2.0], [0.5, 2.0], [2, 3], objective=SEARCH),
         differentiable=False,
         vmap=False,
     ),
     Case(
         "rotation_genetic",
-        lambda: compensate.RotationGenetic(
-            TURNTABLE, [0.1, -2.0], [0.5, 2.0], population=6, generations=2, objective=SEARCH
+        lambda: compensate.EntropyRotation(
+            TURNTABLE, "genetic", [0.1, -2.0], [0.5, 2.0], population=6, generations=2, objective=SEARCH
         ),
         differentiable=False,
         vmap=False,
     ),
     Case(
         "rotation_evolution",
-        lambda: compensate.RotationEvolution(
-            TURNTABLE, [0.1, -2.0], [0.5, 2.0], population=6, generations=2, objective=SEARCH
+        lambda: compensate.EntropyRotation(
+            TURNTABLE, "evolution", [0.1, -2.0], [0.5, 2.0], population=6, generations=2, objective=SEARCH
         ),
         differentiable=False,
         vmap=False,
     ),
     Case(
         "rotation_newton",
-        lambda: compensate.RotationNewton(TURNTABLE, [0.3, 0.5], steps=2, objective=replace(SEARCH, taps=6)),
+        lambda: compensate.EntropyRotation(
+            TURNTABLE, "newton", start=[0.3, 0.5], steps=2, objective=replace(SEARCH, taps=6)
+        ),
         differentiable=False,
         vmap=False,
         tolerance=1e-3,
     ),
     Case(
         "rotation_descent",
-        lambda: compensate.RotationDescent(
-            TURNTABLE, [0.3, 0.5], steps=2, objective=replace(SEARCH, variables="shape")
+        lambda: compensate.EntropyRotation(
+            TURNTABLE, "descent", start=[0.3, 0.5], steps=2, objective=replace(SEARCH, variables="shape")
         ),
         differentiable=False,
         vmap=False,
@@ -397,7 +399,7 @@ CASES = [
     Case("rotation_coarse", lambda: compensate.CoarseRotation(TURNTABLE), differentiable=False, vmap=False),
     Case(
         "rotation_phase_fit",
-        lambda: compensate.PhaseFitRotation(TURNTABLE),
+        lambda: compensate.CoarseRotation(TURNTABLE, fits=4),
         differentiable=False,
         vmap=False,
         tolerance=1e-6,

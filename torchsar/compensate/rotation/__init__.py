@@ -1,66 +1,34 @@
 """Estimation of the rotation of a target that rotates at a changing rate.
 
-Some estimators search for the rotation with the least image entropy; the recommended one fits the
-rotation and the scatterers by maximum likelihood and needs no values to start from.
+`entropy_rotation` searches for the rotation with the least image entropy by one of five methods.
+The recommended estimator, `uneven_rotation`, fits the rotation and the scatterers by maximum
+likelihood and needs no values to start from; `coarse_rotation` makes its first steps.
 """
 
-from torchsar.compensate.rotation.chirplet import ChirpletClean, Chirplets, chirplet_clean
-from torchsar.compensate.rotation.entropy_search import (
-    RotationDescent,
-    RotationEvolution,
-    RotationGenetic,
-    RotationNewton,
-    RotationSearch,
-    descend_rotation,
-    evolve_rotation,
-    genetic_rotation,
-    newton_rotation,
-    search_rotation,
-)
-from torchsar.compensate.rotation.image_entropy import (
-    EntropyObjective,
-    ImageEntropy,
-    RotationParameters,
-    Unknowns,
-    k_name,
-)
+from torchsar.compensate.rotation.chirplet import ChirpletClean, chirplet_clean
+from torchsar.compensate.rotation.entropy_search import EntropyRotation, entropy_rotation
+from torchsar.compensate.rotation.image_entropy import EntropyObjective, ImageEntropy
 from torchsar.compensate.rotation.recommended import (
     CoarseRotation,
-    PhaseFitRotation,
     RotationAutofocus,
     UnevenRotation,
     coarse_rotation,
-    phase_fit_rotation,
-    rotating_autofocus,
+    rotation_autofocus,
     uneven_rotation,
 )
 
 __all__ = [
     "ChirpletClean",
-    "Chirplets",
     "CoarseRotation",
     "EntropyObjective",
+    "EntropyRotation",
     "ImageEntropy",
-    "PhaseFitRotation",
     "RotationAutofocus",
-    "RotationDescent",
-    "RotationEvolution",
-    "RotationGenetic",
-    "RotationNewton",
-    "RotationParameters",
-    "RotationSearch",
     "UnevenRotation",
-    "Unknowns",
     "chirplet_clean",
     "coarse_rotation",
-    "descend_rotation",
-    "evolve_rotation",
-    "genetic_rotation",
-    "k_name",
-    "newton_rotation",
-    "phase_fit_rotation",
-    "rotating_autofocus",
-    "search_rotation",
+    "entropy_rotation",
+    "rotation_autofocus",
     "uneven_rotation",
 ]
 __dir__ = __all__.copy

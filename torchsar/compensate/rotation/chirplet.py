@@ -26,6 +26,7 @@ from torchsar.core import (
 )
 from torchsar.focus.image_lines import DopplerLines
 from torchsar.focus.matched_fourier import matched_fourier
+from torchsar.optim.scalar import vertex
 from torchsar.radar import InverseRadar
 
 # samples that a segment keeps in the fine search, found by trial: reach against time; zero-padding
@@ -66,6 +67,12 @@ def chirplet_clean(
     lines: int | None = None,
 ) -> Chirplets:
     """Form the image of the chirps that make up range-compressed pulses.
+
+    >>> import torch
+    >>> from torchsar.compensate import chirplet_clean
+    >>> pulses = torch.ones(32, 2, dtype=torch.complex64)  # a tone at zero Doppler in each cell
+    >>> chirplet_clean(pulses, 1e3, atoms=1).image.abs().argmax(0)
+    tensor([32, 32])
 
     In each range cell the chirp a exp(-2j pi (f t + r t^2 / 2)) of most energy is found and
     removed, where a is its complex amplitude, f its frequency, r its rate, and t the time from the
@@ -203,12 +210,9 @@ def _vertex(values: Tensor, index: Tensor, circular: bool) -> Tensor:
     It is 0 at an end of an axis that is not circular.
     """
     n = values.shape[-1]
-    left, middle, right = (
-        take(values, (index + i) % n if circular else (index + i).clamp(0, n - 1)).to(torch.float64) for i in (-1, 0, 1)
-    )
-    bend = left - 2 * middle + right
-    inside = (bend < 0) & (circular | ((index > 0) & (index < n - 1)))
-    return torch.where(inside, 0.5 * (left - right) / torch.where(bend < 0, bend, -1), 0).clamp(-0.5, 0.5)
+    near = ((index + i) % n if circular else (index + i).clamp(0, n - 1) for i in (-1, 0, 1))
+    offset = vertex(*(take(values, at).to(torch.float64) for at in near)).clamp(-0.5, 0.5)
+    return offset if circular else torch.where((index > 0) & (index < n - 1), offset, 0)
 
 
 class ChirpletClean(Stage):

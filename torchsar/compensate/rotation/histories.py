@@ -34,7 +34,6 @@ from torchsar.focus.warped_sums import slow_times
 from torchsar.radar.warp import warp, warp_rate
 
 OVERSAMPLING = 2  # image lines per Doppler cell, found by trial: accuracy of peaks against time
-HALF_CELLS = 24  # half width of a window in Doppler cells
 
 
 def noise_power(power: Tensor) -> Tensor:
@@ -135,7 +134,7 @@ class Histories(NamedTuple):
 
 
 def refined_by_histories(
-    data: Tensor, sampling: Sampling, motion: Motion, *, free_centre: bool = True, half_cells: int = HALF_CELLS
+    data: Tensor, sampling: Sampling, motion: Motion, *, free_centre: bool = True, half_cells: int = 24
 ) -> Motion:
     """Refine a rotation by one least-squares fit to the phase histories of bright scatterers.
 
@@ -157,7 +156,7 @@ def refined_by_histories(
 
 
 def histories_of(
-    data: Tensor, sampling: Sampling, motion: Motion, *, free_centre: bool = True, half_cells: int = HALF_CELLS
+    data: Tensor, sampling: Sampling, motion: Motion, *, free_centre: bool = True, half_cells: int = 24
 ) -> Histories:
     """Fit the change of a rotation to the phase histories of bright isolated scatterers.
 

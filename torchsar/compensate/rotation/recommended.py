@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import torch
@@ -21,7 +20,7 @@ from torchsar.compensate.pulse_phase.fixed_point import LogAbove, Run, Wiener, f
 from torchsar.compensate.pulse_phase.imaging import Through
 from torchsar.compensate.rotation.assess import judged_fit, judged_motion
 from torchsar.compensate.rotation.coarse import coarse_warp
-from torchsar.compensate.rotation.histories import HALF_CELLS, refined_by_histories
+from torchsar.compensate.rotation.histories import refined_by_histories
 from torchsar.compensate.rotation.image_entropy import k_name, uniform_rotation, values_of
 from torchsar.compensate.rotation.motion import SEARCH_EPS, Motion, Sampling, each
 from torchsar.compensate.rotation.scatterers import (
@@ -63,6 +62,14 @@ def uneven_rotation(
     assess: bool = True,
 ) -> Estimate:
     """Estimate the rotation of a target with non-uniform rotation; the recommended estimator.
+
+    >>> import torch
+    >>> from torchsar.compensate import uneven_rotation
+    >>> pulses = torch.ones(64, 4, dtype=torch.complex64)
+    >>> range_m = torch.arange(4, dtype=torch.float64)
+    >>> found = uneven_rotation(pulses, wavelength_m=1e-6, prf_hz=1e3, range_m=range_m)
+    >>> found["warp_k"].shape, bool(found.ok)  # nothing off the axis shows a rotation
+    (torch.Size([2]), False)
 
     No values to start from and no search bounds are needed. The estimator has three steps:
     correlation of the Doppler spectra of short sections (`coarse_warp`), least squares on the phase
@@ -151,13 +158,24 @@ def coarse_rotation(
     range_m: Tensor,
     order: int = 3,
     yc_m: Tensor | float | None = None,
+    fits: int = 0,
     assess: bool = True,
 ) -> Estimate:
     """Estimate k1 and k2 from the spectra of short sections, the first step of `uneven_rotation`.
 
+    >>> import torch
+    >>> from torchsar.compensate import coarse_rotation
+    >>> pulses = torch.ones(64, 4, dtype=torch.complex64)
+    >>> range_m = torch.arange(4, dtype=torch.float64)
+    >>> found = coarse_rotation(pulses, wavelength_m=1e-6, prf_hz=1e3, range_m=range_m)
+    >>> found["warp_k"].shape, found["k1_per_s"].shape
+    (torch.Size([2]), torch.Size([]))
+
     The ratio of the rotation rate at time t after the first pulse to that at the first pulse is
     modelled as 1 + k1 t + k2 t^2 / 2 and is found to a few thousandths. The rotation rate itself is
-    not estimated; `omega_rad_s` is 0.
+    not estimated; `omega_rad_s` is 0. With `fits`, least squares on the phase histories of bright
+    scatterers follow, the second step of `uneven_rotation`, which also find the rate. Four fits
+    take half the time of `uneven_rotation`; the errors are two to twenty times as large.
 
     Args:
         data: Range-compressed pulses, shape (..., pulse, range), complex, at least 8 pulses.
@@ -168,6 +186,7 @@ def coarse_rotation(
             rotation; with 2 only k1 is returned, and beyond 3 the further derivatives are 0.
         yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
             rotation centre), if known a priori, a number or shape (...,).
+        fits: Number of times that the least-squares fit to the phase histories is made.
         assess: False leaves out the assessment.
 
     Returns:
@@ -185,64 +204,15 @@ def coarse_rotation(
             number of 1 or more.
     """
     refuse_odd_counts("coarse_rotation", 1, order=order)
-    return _over_trials("coarse_rotation", partial(_start, order), assess, data, wavelength_m, prf_hz, range_m, yc_m)
-
-
-def phase_fit_rotation(
-    data: Tensor,
-    *,
-    wavelength_m: float,
-    prf_hz: float,
-    range_m: Tensor,
-    order: int = 3,
-    yc_m: Tensor | float | None = None,
-    steps: int = 4,
-    half_cells: int = HALF_CELLS,
-    assess: bool = True,
-) -> Estimate:
-    """Estimate the rotation by the first two steps of `uneven_rotation`.
-
-    These steps are the correlation of the spectra of short sections, and least squares on the phase
-    histories of bright scatterers. They take half the time of `uneven_rotation`; the errors are two
-    to twenty times as large.
-
-    Args:
-        data: Range-compressed pulses, shape (..., pulse, range), complex, at least 8 pulses.
-        wavelength_m: Wavelength in metres.
-        prf_hz: Pulse repetition frequency in Hz.
-        range_m: Range coordinates y_n of the cells in metres, evenly spaced, shape (range,).
-        order: Degree of the polynomial of time that describes the rotation angle; 1 is uniform
-            rotation.
-        yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
-            rotation centre), if known a priori, a number or shape (...,); None estimates it.
-        steps: Number of times that the least-squares fit to the phase histories is repeated;
-            four are enough to converge.
-        half_cells: Half width of the windows about scatterers in Doppler cells, at least 4.
-        assess: False leaves out the assessment.
-
-    Returns:
-        `omega_rad_s`, `warp_k` with its entries, and `yc_m`, as from `uneven_rotation` but without
-        standard deviations. quality is the relative decrease of exp(entropy) of the image due to
-        the compensation. The outcomes refer to k1, k2, ..., not to `omega_rad_s` and `yc_m`: EMPTY;
-        NOISE if no pixel clearly exceeds the noise; TOO_FEW with fewer than 3 isolated scatterers,
-        or none off zero Doppler; MISFIT if they are not seen during the whole aperture;
-        PARTS_DISAGREE if the phase error info["phase_error_rad"] that their phase histories show
-        for the scatterer farthest from zero Doppler is above 0.47 rad rms, a Strehl ratio of 0.8.
-
-    Raises:
-        TypeError: If the data are not complex.
-        ValueError: If the data, the range axis or `yc_m` are invalid, or a number is too small.
-    """
-    refuse_odd_counts("phase_fit_rotation", 1, order=order, steps=steps)
-    refuse_odd_counts("phase_fit_rotation", 4, half_cells=half_cells)
+    refuse_odd_counts("coarse_rotation", 0, fits=fits)
 
     def find(rows: Tensor, sampling: Sampling, known: Tensor | None) -> Motion:
         motion = _start(order, rows, sampling, known)
-        for _ in range(steps):
-            motion = refined_by_histories(rows, sampling, motion, free_centre=known is None, half_cells=half_cells)
+        for _ in range(fits):
+            motion = refined_by_histories(rows, sampling, motion, free_centre=known is None)
         return motion
 
-    return _over_trials("phase_fit_rotation", find, assess, data, wavelength_m, prf_hz, range_m, yc_m)
+    return _over_trials("coarse_rotation", find, assess, data, wavelength_m, prf_hz, range_m, yc_m)
 
 
 def _start(order: int, rows: Tensor, sampling: Sampling, known: Tensor | None) -> Motion:
@@ -384,7 +354,7 @@ class UnevenRotation(_Rotation):
 
 
 class CoarseRotation(_Rotation):
-    """Relative derivatives k1 and k2 of the rotation rate, without the rate; see `coarse_rotation`.
+    """Relative derivatives k1 and k2 of the rotation rate; see `coarse_rotation`.
 
     They are found from the Doppler spectra of short sections of the aperture.
 
@@ -392,27 +362,10 @@ class CoarseRotation(_Rotation):
         radar: Radar parameters.
         order: Degree of the polynomial of time that describes the rotation angle; 1 is uniform
             rotation.
-        assess: False leaves out the assessment.
-
-    Raises:
-        ValueError: If the order is below 1.
-    """
-
-    def __init__(self, radar: InverseRadar, order: int = 3, assess: bool = True) -> None:
-        super().__init__(radar, order, None, coarse_rotation, assess=assess)
-
-
-class PhaseFitRotation(_Rotation):
-    """Non-uniform rotation from the phase histories of bright scatterers; see `phase_fit_rotation`.
-
-    Args:
-        radar: Radar parameters.
-        order: Degree of the polynomial of time that describes the rotation angle; 1 is uniform
-            rotation.
         yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
-            rotation centre), if known a priori; None estimates it.
-        steps: Number of times that the least-squares fit to the phase histories is repeated.
-        half_cells: Half width of the windows about scatterers in Doppler cells.
+            rotation centre), if known a priori.
+        fits: Number of least-squares fits to the phase histories of bright scatterers, which also
+            find the rotation rate.
         assess: False leaves out the assessment.
 
     Raises:
@@ -420,22 +373,16 @@ class PhaseFitRotation(_Rotation):
     """
 
     def __init__(
-        self,
-        radar: InverseRadar,
-        order: int = 3,
-        yc_m: float | None = None,
-        steps: int = 4,
-        half_cells: int = HALF_CELLS,
-        assess: bool = True,
+        self, radar: InverseRadar, order: int = 3, yc_m: float | None = None, fits: int = 0, assess: bool = True
     ) -> None:
-        super().__init__(radar, order, yc_m, phase_fit_rotation, steps=steps, half_cells=half_cells, assess=assess)
+        super().__init__(radar, order, yc_m, coarse_rotation, fits=fits, assess=assess)
 
 
 class RotationAutofocus(Stage):
     """Phase error of each pulse of a rotating target, common to all its scatterers.
 
     Provides `phase_rad`. If another stage provides `warp_k`, the phases are found by
-    `rotating_autofocus`, otherwise by `autofocus`.
+    `rotation_autofocus`, otherwise by `autofocus`.
 
     The phase of every pulse is free and therefore also takes up the effect of the range centre
     deviation yc. If an estimator of the rotation alternates with this stage, give it a fixed yc.
@@ -477,7 +424,7 @@ class RotationAutofocus(Stage):
                 rotation centre), shape (...,); by default 0.
 
         Returns:
-            `phase_rad` of shape (..., pulse), to be removed: the estimate of `rotating_autofocus`,
+            `phase_rad` of shape (..., pulse), to be removed: the estimate of `rotation_autofocus`,
             or of `autofocus` if `warp_k` is None.
 
         Raises:
@@ -498,10 +445,10 @@ class RotationAutofocus(Stage):
                 0.0 if yc_m is None else yc_m,
             )
         k = warp_k.expand(*signal.trials, warp_k.shape[-1]).reshape(-1, warp_k.shape[-1])
-        return rotating_autofocus(data, prf_hz, k, phase_rad, **self.options)
+        return rotation_autofocus(data, prf_hz, k, phase_rad, **self.options)
 
 
-def rotating_autofocus(
+def rotation_autofocus(
     data: Tensor,
     prf_hz: float,
     warp_k: Tensor,
@@ -511,6 +458,12 @@ def rotating_autofocus(
     assess: bool = True,
 ) -> Estimate:
     """Estimate the phase error of each pulse of a target whose non-uniform rotation is known.
+
+    >>> import torch
+    >>> from torchsar.compensate import rotation_autofocus
+    >>> pulses, k = torch.ones(64, 4, dtype=torch.complex64), torch.zeros(1, 2, dtype=torch.float64)
+    >>> rotation_autofocus(pulses, 1e3, k)["phase_rad"].shape
+    torch.Size([64])
 
     The phases are those with which the image, formed by the matched Fourier transform for this
     rotation, is sharpest.
@@ -540,8 +493,8 @@ def rotating_autofocus(
         ValueError: If the data are empty or not finite, the start does not have one phase per
             pulse, or a number of iterations is not a whole number of 0 or more.
     """
-    pulses = prepare(data, "rotating_autofocus", empty=False)
-    refuse_odd_counts("rotating_autofocus", 0, search=search, polish=polish)
+    pulses = prepare(data, "rotation_autofocus", empty=False)
+    refuse_odd_counts("rotation_autofocus", 0, search=search, polish=polish)
     through = Through(
         MatchedFourierOperator(
             warp_k, pulses.n, prf_hz, dtype=data.dtype, lines=DopplerLines(1.0), transform=Gridding(eps=SEARCH_EPS)
@@ -557,5 +510,5 @@ def rotating_autofocus(
         return fixed_point(rows, at, replace(runs[1], iterations=6))[0]
 
     with torch.no_grad():
-        begin = starting_phase(start, pulses, "rotating_autofocus")
+        begin = starting_phase(start, pulses, "rotation_autofocus")
         return conclude(pulses, *find_phases(pulses, find, begin, whole=True), assess, continued, through)

@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import Tensor
 
-from torchsar.compensate import EntropyObjective, ImageEntropy, coarse_rotation, descend_rotation
+from torchsar.compensate import EntropyObjective, ImageEntropy, coarse_rotation, entropy_rotation
 from torchsar.core import Axis, Estimate, Signal
 from torchsar.focus import MatchedFourier, RangePhase
 from torchsar.radar import LIGHT_M_S, InverseRadar
@@ -44,6 +44,6 @@ def second_order(signal: Signal, radar: InverseRadar) -> Estimate:
     then by least entropy. It is not k1 of the target but about k1 + k2 T / 2.
     """
     figure = ImageEntropy.of(signal, radar, EntropyObjective(order=2, range_term=False))
-    return descend_rotation(
-        figure, figure.start(0.0, coarse_rotation(signal.data, order=2, **known_of(signal, radar))["warp_k"])
+    return entropy_rotation(
+        figure, "descent", figure.start(0.0, coarse_rotation(signal.data, order=2, **known_of(signal, radar))["warp_k"])
     )

@@ -23,7 +23,7 @@ from torchsar.compensate import (
     ImageEntropy,
     autofocus,
     correct_pulse_phase,
-    genetic_rotation,
+    entropy_rotation,
     uneven_rotation,
 )
 from torchsar.core import Draws, Estimate, Signal, Truth
@@ -65,7 +65,7 @@ def _published(signal: Signal, generations: int) -> Estimate:
     """The genetic algorithm in a box of +-20 % about what the turntable was set to."""
     figure = ImageEntropy.of(signal, RADAR)
     centre = torch.tensor([math.radians(10), 6.0, 1100.0], dtype=torch.float64)
-    return genetic_rotation(figure, 0.8 * centre, 1.2 * centre, draws=Draws(1), generations=generations)
+    return entropy_rotation(figure, "genetic", (0.8 * centre, 1.2 * centre), draws=Draws(1), generations=generations)
 
 
 def _results(signal: Signal, truth: Truth, generations: int) -> tuple[dict[str, Signal], dict[str, Rotation]]:

@@ -21,7 +21,7 @@ from torchsar.compensate import (
     EntropyObjective,
     ImageEntropy,
     chirplet_clean,
-    newton_rotation,
+    entropy_rotation,
     uneven_rotation,
 )
 from torchsar.core import Axis, Draws, Estimate, Signal, Truth
@@ -222,7 +222,7 @@ def _starts(small: bool) -> _Seen:
     for factor in FACTORS:
         figure = ImageEntropy.of(signal, radar, EntropyObjective(oversampling=2.0))
         start = figure.start(factor * TRUTH[0], factor * TRUTH[1:])
-        found[factor] = newton_rotation(figure, start, damped=False, steps=1 if small else 20)
+        found[factor] = entropy_rotation(figure, "newton", start, damped=False, steps=1 if small else 20)
     found[None] = uneven_rotation(signal.data, **known_of(signal, radar))
     return _Seen(signal, radar, found)
 

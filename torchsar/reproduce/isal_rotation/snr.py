@@ -31,7 +31,7 @@ import torch
 from torch import Tensor
 
 from torchsar import plot
-from torchsar.compensate import EntropyObjective, ImageEntropy, genetic_rotation, uneven_rotation
+from torchsar.compensate import EntropyObjective, ImageEntropy, entropy_rotation, uneven_rotation
 from torchsar.core import Draws, Estimate, Signal, Truth
 from torchsar.echo import simulate_turntable
 from torchsar.focus import MatchedFourier
@@ -100,10 +100,10 @@ def _genetic(oversampling: float, generations: int, population: int = 30) -> Fin
     """All trials of a batch at once, each with random numbers of its own."""
 
     def find(signal: Signal, radar: InverseRadar) -> Estimate:
-        return genetic_rotation(
+        return entropy_rotation(
             ImageEntropy.of(signal, radar, EntropyObjective(oversampling=oversampling)),
-            LOW,
-            HIGH,
+            "genetic",
+            (LOW, HIGH),
             draws=Draws(1, trials=range(len(signal.data))),
             population=population,
             generations=generations,

@@ -11,8 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchsar.compensate.rotation import coarse_rotation, phase_fit_rotation, uneven_rotation
-from torchsar.compensate.rotation.entropy_search import descent_near_truth, genetic_near_truth
+from torchsar.compensate import EntropyObjective, ImageEntropy, coarse_rotation, entropy_rotation, uneven_rotation
 from torchsar.core import Draws, Estimate
 from torchsar.focus import DopplerLines, ExplicitSum, Gridding, Resampling, matched_fourier, range_phase
 from torchsar.focus.requirements import Limit, Requirement
@@ -249,15 +248,34 @@ def _draws(bench: Bench) -> Draws:
     return bench.draws("trade", range(bench.config.trade.trials))
 
 
+def _descent_near_truth(
+    data: Tensor, omega_rad_s: Tensor, warp_k: Tensor, *, order: int, yc_m: float | None, **known: Any
+) -> Estimate:
+    """Descent of the image entropy that starts at 0.95 of the true values."""
+    figure = ImageEntropy(data, EntropyObjective(order=order, yc_m=yc_m or 0.0, variables="shape"), **known)
+    return entropy_rotation(figure, "descent", figure.start(0.95 * omega_rad_s, 0.95 * warp_k))
+
+
+def _genetic_near_truth(
+    data: Tensor, omega_rad_s: Tensor, warp_k: Tensor, *, order: int, yc_m: float | None, **known: Any
+) -> Estimate:
+    """A genetic algorithm within 10 % of the true values, short enough to compare."""
+    figure = ImageEntropy(data, EntropyObjective(order=order, yc_m=yc_m or 0.0), **known)
+    centre = torch.cat([omega_rad_s[..., None], warp_k], -1)
+    half = 0.1 * torch.where(centre != 0, centre.abs(), 1)
+    box = (centre - half, centre + half)
+    return entropy_rotation(figure, "genetic", box, draws=Draws(1), population=10, generations=4)
+
+
 _ESTIMATORS: dict[str, Callable[..., Estimate]] = {
     "coarse": coarse_rotation,
-    "phase fit": phase_fit_rotation,
+    "phase fit": partial(coarse_rotation, fits=4),
     "recommended, 30 scatterers": partial(uneven_rotation, scatterers=30),
     "recommended, 1 round": partial(uneven_rotation, rounds=1),
     "recommended": uneven_rotation,
     "recommended, complex128": lambda data, **known: uneven_rotation(data.to(torch.complex128), **known),
-    _DESCENT: descent_near_truth,
-    _GENETIC: genetic_near_truth,
+    _DESCENT: _descent_near_truth,
+    _GENETIC: _genetic_near_truth,
 }
 
 

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.compensate.rotation import CoarseRotation, k_name
+from torchsar.compensate.rotation import CoarseRotation
+from torchsar.compensate.rotation.image_entropy import k_name
 from torchsar.core import Chain, Estimate, Signal, unit_phasor
 from torchsar.focus.image_lines import mean_rate
 
