@@ -37,9 +37,6 @@ from torchsar.metrics import entropy
 MOST_PHASE_ERROR_RAD = math.sqrt(-math.log(0.8))
 _LEAST_SCATTERERS = 3  # fewer do not determine the rotation reliably, a convention
 _CLEAR = 1.3  # power over the detection threshold that noise alone exceeds in one of 1000 images
-# scatterers that outweigh the variance that the noise explains: a variance that a few of them show
-# is uncertain by a factor, found by trial
-_FEW = 2.0
 
 
 def judged_motion(rows: Tensor, sampling: Sampling, motion: Motion, value: Mapping[str, Tensor]) -> Estimate:
@@ -121,9 +118,9 @@ def judged_fit(rows: Tensor, sampling: Sampling, fit: Fit, value: Mapping[str, T
     own = (pull - torch.einsum("bpij,bj->bpi", curvature, change)) @ inverse
     seen = (own * (alike @ own)).sum(1) / predicted
     number = 1 / (shares * (alike @ shares)).sum(1).clamp_min(tiny)
-    wider = (number * seen + _FEW + number.clamp_max(predicted.shape[-1])) / (
-        number + _FEW
-    ) + change.square() / predicted
+    # two scatterers outweigh the variance that the noise explains, found by trial: a variance that
+    # a few of them show is uncertain by a factor
+    wider = (number * seen + 2 + number.clamp_max(predicted.shape[-1])) / (number + 2) + change.square() / predicted
     wider = wider.sqrt() / accounted.clamp_min(1e-6)[:, None]
     covariance = covariance * wider[:, :, None] * wider[:, None] + torch.diag_embed(torch.where(lost, math.inf, 0.0))
     std = _standard_deviations(motion, covariance, fit.change.shape[-1] > order + 1)

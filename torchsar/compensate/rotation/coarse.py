@@ -23,12 +23,8 @@ from torchsar.focus.transforms import Gridding
 from torchsar.metrics import entropy
 from torchsar.radar.warp import warp, warp_rate
 
-_OCTAVES = 3.5  # Doppler below the edge of the band that is used, found by trial
 _STEPS_PER_UNIT = 200  # steps per unit of the logarithm of Doppler: half a percent each
 _WIDEST = 1.4  # largest logarithm of a ratio of rates that is searched: a factor of 4
-# step of the search, in logarithms of rates at the middle and the end of the aperture; candidates
-# of this grid that are refined, found by trial: reliability against time
-_GRID, _KEPT = 0.07, 6
 _LEAST_RATE = 0.1  # least rate over that at the start; slower targets would nearly reverse
 
 
@@ -114,14 +110,16 @@ def _change_of_rate(rows: Tensor, prf_hz: float, sections: int, widest: float) -
         score = torch.where(warp_rate(times, k).amin(-1) > _LEAST_RATE, score, -math.inf)
         return torch.gather(candidates, 1, score.topk(count, -1).indices[..., None].expand(-1, -1, 2))
 
-    step = torch.arange(-widest, widest + 1e-9, _GRID, **like)
+    # step of the search in logarithms of rates, and candidates of this grid that are refined, found
+    # by trial: reliability against time
+    size, kept = 0.07, 6
+    step = torch.arange(-widest, widest + 1e-9, size, **like)
     best = torch.cartesian_prod(step, step).expand(rows.shape[0], -1, -1)
     # a blur of about half a step of the grid, so that no peak is missed
-    best = best_of(best, _correlations(products, 0.03), _KEPT)
+    best = best_of(best, _correlations(products, 0.03), kept)
     # the maximum is flat: rounding in single precision would move it
     table = _correlations(products.to(torch.complex128), 0.0)
     nearby = torch.cartesian_prod(*2 * [torch.linspace(-1, 1, 5, **like)])
-    size, kept = _GRID, _KEPT
     for _ in range(10):  # each refinement halves the step: to 0.0001 of a rate
         kept = max(1, kept // 2)
         best = best_of((best[:, :, None] + size * nearby).flatten(1, 2), table, kept)
@@ -163,8 +161,9 @@ def _log_spectra(data: Tensor, length: int) -> Tensor:
     """
     window = torch.hann_window(length, periodic=False, dtype=data.real.dtype, device=data.device)
     spectrum = torch.fft.fft(data.unfold(1, length, length // 2) * window, 2 * length).abs()
-    steps = math.ceil(_OCTAVES * math.log(2) * _STEPS_PER_UNIT)
-    logs = torch.arange(steps, dtype=torch.float64, device=data.device) / _STEPS_PER_UNIT - _OCTAVES * math.log(2)
+    reach = 3.5 * math.log(2)  # octaves below the edge of the band, found by trial
+    steps = math.ceil(reach * _STEPS_PER_UNIT)
+    logs = torch.arange(steps, dtype=torch.float64, device=data.device) / _STEPS_PER_UNIT - reach
     position = torch.exp(logs) * (length - 1)
     whole = position.floor().long().clamp(0, length - 2)
     rest = (position - whole).to(spectrum.dtype)

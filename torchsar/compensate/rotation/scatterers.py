@@ -35,9 +35,6 @@ MOST, ROUNDS = 800, 12  # largest number of scatterers, number of steps; accurac
 # brightest alone bring the motion near, and the rounds between let it converge
 _SEARCHES = {0: 0.1, 2: 0.6, 4: 1.0}
 _SEARCHED = max(_SEARCHES)
-# phasors of a block of pulses that fit into the cache; pulses over which the phase of an echo
-# changes by a few turns
-_BLOCK_BYTES, _GROUP = 1 << 19, 16
 _STEP = 0.3  # largest motion of a scatterer in one step, in cells: beyond it the model is not linear
 # least share of the energy above the noise that the scatterers explain, found by trial: a lower
 # share accepts wrong focus, a higher one rejects targets of many faint scatterers
@@ -214,10 +211,10 @@ def _phasors(left: Tensor, right: Tensor, dtype: torch.dtype) -> Tensor:
     every few is computed in float64, the differences of its neighbours from it, a few turns, in the
     working precision. Faster than `core.unit_phasor` of every element.
     """
-    working, pulses = real_dtype(dtype), left.shape[1]
-    near = torch.arange(pulses, device=left.device) // _GROUP * _GROUP + _GROUP // 2
+    working, pulses, group = real_dtype(dtype), left.shape[1], 16
+    near = torch.arange(pulses, device=left.device) // group * group + group // 2
     near = near.clamp_max(pulses - 1)
-    begin = reduced_turns(left[:, near[::_GROUP]] @ right).to(working).repeat_interleave(_GROUP, 1)[:, :pulses]
+    begin = reduced_turns(left[:, near[::group]] @ right).to(working).repeat_interleave(group, 1)[:, :pulses]
     turns = torch.baddbmm(begin, (left - left[:, near]).to(working), right.to(working))
     angle = (turns - turns.round()) * (2 * math.pi)
     return torch.complex(torch.cos(angle), torch.sin(angle))
@@ -230,8 +227,8 @@ def _blocks(data: Tensor, scatterers: int) -> Iterator[tuple[slice, slice]]:
     other trials of a batch have, so that sums round equally.
     """
     trials, pulses, line = data.shape[0], data.shape[1], data.element_size() * max(1, scatterers)
-    height = min(pulses, max(16, _BLOCK_BYTES // line))
-    some = max(1, _BLOCK_BYTES // (line * height))
+    height = min(pulses, max(16, (1 << 19) // line))
+    some = max(1, (1 << 19) // (line * height))
     for trial, first in itertools.product(range(0, trials, some), range(0, pulses, height)):
         yield slice(trial, trial + some), slice(first, first + height)
 
