@@ -27,9 +27,6 @@ from torchsar.study.trials.system import per_trial_first
 
 log = logging.getLogger("torchsar")
 FILES = ("config.yaml", "metrics.json", "arrays.zarr", "figures", "report.html")
-# largest tensor of a batch in bytes: large enough for efficient calls, and small relative to the
-# memory of a machine that can process one trial
-_BATCH_BYTES = 256 << 20
 # metrics.json has only the mean of estimates with more numbers than this; arrays.zarr has all
 _LISTED = 16
 
@@ -99,7 +96,9 @@ def run(loaded: Loaded, out: Path, command: str = "torchsar run", device: str = 
 def _chunks(bench: Bench) -> list[range]:
     """Numbers of the trials of each batch of a case."""
     count = 1 if bench.recording is not None else bench.world().trials
-    height = max(1, min(count, _BATCH_BYTES // max(1, bench.bytes_per_trial)))
+    # largest tensor of a batch in bytes: large enough for efficient calls, and small relative to
+    # the memory of a machine that can process one trial
+    height = max(1, min(count, (256 << 20) // max(1, bench.bytes_per_trial)))
     return [range(first, min(first + height, count)) for first in range(0, count, height)]
 
 

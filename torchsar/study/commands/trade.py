@@ -36,8 +36,6 @@ log = logging.getLogger("torchsar")
 FILES = ("config.yaml", "trade.json", "trade.txt", "figures")
 # what the work of an alternative raises where it cannot be done on this scene
 _FAILURES = (ValueError, TypeError, KeyError, RuntimeError, ArithmeticError)
-# work is repeated for so long (s) that its time is known to a percent or so
-_LEAST_S = 0.1
 # losses below this (dB), those of rounding in double precision, are drawn at it
 _DRAWN_DB = -150.0
 Row = dict[str, Any]
@@ -131,7 +129,8 @@ class _Tried:
         try:
             # kept memory is returned before memory is measured, which takes time
             with nullcontext() if self.times else PeakMemory(self.device) as peak:
-                spent, result = _spent(lambda: self.measured.run(self.one), _LEAST_S if self.times else 0.0)
+                # work is repeated for so long (s) that its time is known to a percent or so
+                spent, result = _spent(lambda: self.measured.run(self.one), 0.1 if self.times else 0.0)
             if peak is not None:
                 self.peak_bytes = peak.bytes
                 self.loss = {name: float(value) for name, value in self.measured.loss(self.one, result).items()}

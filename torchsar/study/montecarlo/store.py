@@ -32,11 +32,6 @@ from torchsar.study.settings.errors import ConfigError, one_line
 
 # number of the layout of the store; another one is refused on resume
 FORMAT = 3
-# numbers in a zarr chunk at most: half a megabyte, which is written whole for every change
-_CHUNK_NUMBERS = 1 << 16
-# results are written every so many seconds, or more often if writing takes half a percent of the
-# time at most, and less often if it would take a tenth
-_EVERY_S, _CHEAP, _DEAR = 4.0, 0.005, 0.1
 # trials whose arrays wait to be written at most, since they fill the memory meanwhile
 _WAITING = 64
 _DONE, _SAVED = "done", "saved"
@@ -119,7 +114,9 @@ class Store:
         of this time, later if it takes more than 10 %, or if the saved arrays of 64 trials wait to
         be written.
         """
-        interval = max(min(self._cost / _CHEAP, _EVERY_S), self._cost / _DEAR)
+        # results are written every so many seconds, or more often if writing takes half a percent
+        # of the time at most, and less often if it would take a tenth
+        interval = max(min(self._cost / 0.005, 4.0), self._cost / 0.1)
         return time.perf_counter() - self._last > interval or len(self._pending) >= _WAITING
 
     @property
@@ -193,7 +190,9 @@ class Store:
         """
         if name not in self._arrays:
             leading = tuple(max(1, min(n, 64)) for n in data.shape[:-1])
-            chunk = max(1, min(data.shape[-1], 1024, _CHUNK_NUMBERS // max(1, int(np.prod(leading)))))
+            # numbers in a zarr chunk at most: half a megabyte, which is written whole for every
+            # change
+            chunk = max(1, min(data.shape[-1], 1024, (1 << 16) // max(1, int(np.prod(leading)))))
             made: dict[str, Any] = {
                 "shape": data.shape,
                 "dtype": data.dtype,

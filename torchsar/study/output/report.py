@@ -18,9 +18,6 @@ from torchsar.plot import name_and_unit
 from torchsar.study.output.numbers import MISSING, number, quantity, scale_of
 from torchsar.study.output.pictures import Picture
 
-# largest number of metrics shown above the tables: two rows of four on a wide screen
-_TILES = 8
-
 
 class Column(Protocol):
     """Presentation of a metric."""
@@ -87,7 +84,8 @@ def run_fields(metrics: Mapping[str, Any], columns: Shown, target_columns: Shown
     best, cases = methods["recommended"], list(methods["recommended"]["cases"])
     shown = {key: column for key, column in columns.items() if best["metrics"].get(key) is not None}
     first = best["metrics"]
-    tiles = [(quantity(first[key], c.unit, _sd(first, key)), c.label) for key, c in list(shown.items())[:_TILES]]
+    # largest number of metrics shown above the tables: two rows of four on a wide screen
+    tiles = [(quantity(first[key], c.unit, _sd(first, key)), c.label) for key, c in list(shown.items())[:8]]
     rows = {name: method["cases"] for name, method in methods.items()}
     published = metrics["published"]
     tables = (

@@ -12,8 +12,6 @@ from torchsar.metrics.impulse import impulse_response
 
 # samples to either side that a cut has at least, and further ones that its interpolation needs
 _LEAST, _MORE = 24, 8
-# null spacings to either side that a cut has: ten side lobes and half of the main lobe
-_NULLS = 11
 # positions of a cut per sample
 _FACTOR = 16
 # -3 dB width of a response over the spacing of its nulls
@@ -39,7 +37,8 @@ def impulse_cuts(image: Signal, at_m: tuple[float, float]) -> dict[str, tuple[Te
     positions, windows, reaches = [], [], []
     for axis in image.axes:
         nulls = float(measured[f"irw_{axis.name}_m"]) / _WIDTH / axis.step
-        reach = min(max(_LEAST, math.ceil(_NULLS * nulls)), axis.n // 2) if math.isfinite(nulls) else _LEAST
+        # null spacings to either side that a cut has: ten side lobes and half of the main lobe
+        reach = min(max(_LEAST, math.ceil(11 * nulls)), axis.n // 2) if math.isfinite(nulls) else _LEAST
         at = float(axis.index_of(measured[f"position_{axis.name}_m"]))
         first = max(0, min(round(at) - reach - _MORE, axis.n - 2 * (reach + _MORE)))
         windows.append(slice(first, first + 2 * (reach + _MORE)))

@@ -31,12 +31,8 @@ from torchsar.study.trials.choice import Alternative, Choice, Measured, beside_d
 from torchsar.study.trials.direct_images import DirectlySummed, turning_target
 from torchsar.study.trials.system import Noise
 
-# products of pulses, lines and range cells up to which the sum itself is the yardstick
-_EXPLICIT = 3e8
 # orders of the rotation that are compared, and more where the target has more
 _ORDERS = 4
-# largest width of kernels that are compared
-_TAPS = (2, 3, 4, 5, 6, 7, 8)
 # lines so fine that a peak between two of them loses less than 0.01 dB
 _FINE = DopplerLines(16.0)
 # estimators that start near the truth, by name
@@ -68,7 +64,8 @@ def choices(bench: Bench) -> list[Choice]:
     transform along slow time, estimator of the rotation, and echo model.
     """
     orders = [_order(order, bench) for order in range(1, max(_ORDERS, 1 + len(_rotation(bench.world())[1])) + 1)]
-    kernels = {f"gridding, {taps} taps": Gridding(taps=taps) for taps in _TAPS}
+    # largest width of kernels that are compared
+    kernels = {f"gridding, {taps} taps": Gridding(taps=taps) for taps in (2, 3, 4, 5, 6, 7, 8)}
     transforms = [
         *(
             Alternative(f"{kind} interpolation", _resampling(kind), None, "the edge of the Doppler band")
@@ -216,7 +213,8 @@ def _transforms(bench: Bench) -> Measured:
     """The matched Fourier transform of whole trials by each transform."""
     trials = bench.trials(_draws(bench))
     exact, k = _without_range_term(bench, trials).to(torch.complex128), trials.truth["warp_k"]
-    best = ExplicitSum() if 2 * exact.numel() * exact.shape[-2] <= _EXPLICIT else Gridding(eps=1e-12, oversampling=2.0)
+    # products of pulses, lines and range cells up to which the sum itself is the yardstick
+    best = ExplicitSum() if 2 * exact.numel() * exact.shape[-2] <= 3e8 else Gridding(eps=1e-12, oversampling=2.0)
     truth, data = matched_fourier(exact, k, bench.radar.prf_hz, transform=best), exact.to(bench.dtype)
 
     def run(one: Alternative) -> Tensor:

@@ -17,8 +17,6 @@ from torchsar.focus.image_lines import mean_rate
 _HALF_POWER = 10 ** (-3.0 / 10)
 # chosen: points of a cut per line of the image, and lines beside it that keep its ends undisturbed
 _FINER, _MARGIN = 8, 64
-# fewer lines than this do not show a main lobe with its side lobes
-_FEWEST = 8
 
 
 @dataclass(frozen=True)
@@ -243,7 +241,8 @@ def cross_range_cut(
     middle = ((x_m - start) / step).round().long()
     reach = (search_m / step).ceil().long()
     first, last = (middle - reach).clamp(0, n), (middle + reach + 1).clamp(0, n)
-    if not bool((last - first >= _FEWEST).all()):
+    # fewer lines than this do not show a main lobe with its side lobes
+    if not bool((last - first >= 8).all()):
         return None
     longest = int((last - first).max())
     margin = max(_MARGIN, longest)
