@@ -162,17 +162,13 @@ def _brightest(image: Signal) -> Tensor:
     return take(image.data.mT, line, -2)
 
 
-def _range_cut(image: Signal) -> Tensor:
-    """Range profile of the strongest azimuth line of each trial, (trial, range)."""
-    return take(image.data, image.data.abs().amax(-1).argmax(-1), -2)
-
-
 def _measured(batch: _Batch, made: _Product) -> Tensor:
     """Numbers named by FIGURES, (trial, figure)."""
     profile, step = _brightest(made.image), made.image.axis("azimuth").step
+    across_peak = take(made.image.data, made.image.data.abs().amax(-1).argmax(-1), -2)  # (trial, range)
     own, across = (
         azimuth_response(profile, step),
-        azimuth_response(_range_cut(made.image), made.image.axis("range").step / 2),
+        azimuth_response(across_peak, made.image.axis("range").step / 2),
     )
     zones = replica_zones(
         RADAR,
@@ -252,10 +248,14 @@ def _scene(small: bool) -> Signal:
 
 def _figure_16(data: Signal, path: Path) -> list[Check]:
     at_rest = FocusAzimuth(RADAR, bandwidth_hz=BANDWIDTH_HZ)(Reconstruct(RADAR)(CorrectMigration(RADAR)(data)))
+    # range from the reference on the axis c tau / 2, azimuth horizontal
+    azimuth, range_ = at_rest.axes
+    start_m, step_m = (range_.start - RADAR.reference_range_m) / 2, range_.step / 2
+    whole = Signal(at_rest.data.mT, (Axis("range", range_.n, start_m, step_m, "m"), azimuth))
     lines = {name: (np.full(2, x), np.array([-115.0, 115.0])) for name, (x, _) in POSITIONS.items()}
     part = {
         "title": "four targets as if at rest; lines: true azimuth",
-        "signal": _transposed(_relative(at_rest)),
+        "signal": whole,
         "lines": lines,
     }
     plot.save(plot.overlays([part], dynamic_range_db=50), path, columns=1)
@@ -275,20 +275,6 @@ def _own_image(data: Signal, name: str) -> Signal:
     shown = RADAR.speed_m_s * float(PointMotion.of(RADAR, data.data, **values, range_m=range_m).image_s)
     part = image.sel(azimuth=slice(shown - 20.0, shown + 20.0), range=slice(range_m - 40.0, range_m + 40.0))
     return _finer(_near(part.with_data(part.data[None]), 6.0, 15.0, 0))
-
-
-def _relative(image: Signal) -> Signal:
-    """Range from the reference on the axis c tau / 2."""
-    azimuth, range_ = image.axes
-    return Signal(
-        image.data,
-        (azimuth, Axis("range", range_.n, (range_.start - RADAR.reference_range_m) / 2, range_.step / 2, "m")),
-    )
-
-
-def _transposed(image: Signal) -> Signal:
-    """Azimuth horizontal."""
-    return Signal(image.data.mT, image.axes[::-1])
 
 
 def _size(small: bool) -> tuple[int, int]:

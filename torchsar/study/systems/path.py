@@ -51,7 +51,7 @@ from torchsar.study.trials.batch import IMAGE, Batch, Judged, Metrics, Processed
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Alternative, Choice, Measured
 from torchsar.study.trials.direct_images import some_pixels, white_noise
-from torchsar.study.trials.system import Column, Noise, System, World
+from torchsar.study.trials.system import Column, Noise, System, World, by_limit
 
 
 def path_radar(carrier_hz: float, bandwidth_hz: float, prf_hz: float) -> InverseRadar:
@@ -393,8 +393,7 @@ class AnyPath(System):
             else (AntennaPath.recorded(bench.recording.aux), bench.recording.aux["frequency_hz"])
         )
         images = {name: last_image(chain.stages.values()) for name, chain in bench.chains.items()}
-        found = [(limit, name) for name, one in images.items() if one for limit in one.sampling_limits(*geometry)]
-        return {limit: [name for other, name in found if other == limit] for limit, _ in found}
+        return by_limit((at, name) for name, one in images.items() if one for at in one.sampling_limits(*geometry))
 
     def choices(self, bench: Bench) -> Sequence[Choice]:
         stage = last_image(bench.chains["recommended"].stages.values())

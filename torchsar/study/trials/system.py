@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any, ClassVar
@@ -260,3 +260,11 @@ def _of_case(draw: Draw, case: str, result: Result) -> Drawn:
     end = "" if case == ALL and result.bench.system.plain_names else f"_{word_of(case)}"
     for name, title, caption, figure in draw(result):
         yield name + end, titled(title, case), caption, figure
+
+
+def by_limit(found: Iterable[tuple[Limit, str]]) -> dict[Limit, list[str]]:
+    """Return the methods that each limit concerns, from pairs of a limit and a method."""
+    table: dict[Limit, list[str]] = {}
+    for limit, name in found:
+        table.setdefault(limit, []).append(name)
+    return table

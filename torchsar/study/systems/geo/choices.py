@@ -48,6 +48,7 @@ from torchsar.study.trials.batch import Trials
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Alternative, Choice, Measured, beside_direct_sum
 from torchsar.study.trials.direct_images import DirectlySummed, points_at_rest
+from torchsar.study.trials.system import by_limit
 
 _ESTIMATORS: dict[type, Estimator] = {
     SignalIntensityRatio: "sir",
@@ -73,11 +74,8 @@ _DIMENSIONS = ("azimuth only", "range lines", "full chirps")
 
 def limits(bench: Bench) -> dict[Limit, list[str]]:
     """Return the limits of methods in this scene, with the methods that each concerns."""
-    found: dict[Limit, list[str]] = {}
-    for name, chain in bench.chains.items():
-        for limit in multichannel_limits(bench.radar, use_of(chain, bench)):
-            found.setdefault(limit, []).append(name)
-    return found
+    chains = bench.chains.items()
+    return by_limit((one, name) for name, c in chains for one in multichannel_limits(bench.radar, use_of(c, bench)))
 
 
 def requirements(bench: Bench) -> Sequence[Requirement]:

@@ -30,6 +30,7 @@ from torchsar.study.settings.errors import ConfigError
 from torchsar.study.systems.geo_ocean.judge import FoundTarget, MadeScene, matched, ship_metrics
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Alternative, Choice, Measured
+from torchsar.study.trials.system import by_limit
 
 # integration time (s) of the source, for scenes that are seen through a pattern
 _PATTERN_S = 4.5
@@ -48,12 +49,8 @@ _NOT_HERE = (
 
 def limits(bench: Bench) -> dict[Limit, list[str]]:
     """Return the limits of methods in this scene, with the methods that each concerns."""
-    found: dict[Limit, list[str]] = {}
-    for name in bench.chains:
-        for limit in (*multichannel_limits(bench.radar, _use_of(bench, name)), *_swath_limits(bench, name)):
-            if limit.name not in _NOT_HERE:
-                found.setdefault(limit, []).append(name)
-    return found
+    every = {n: [*multichannel_limits(bench.radar, _use_of(bench, n)), *_swath_limits(bench, n)] for n in bench.chains}
+    return by_limit((one, name) for name, of in every.items() for one in of if one.name not in _NOT_HERE)
 
 
 def requirements(bench: Bench) -> Sequence[Requirement]:

@@ -268,8 +268,9 @@ class IsalRotation(System):
     def limits(self, bench: Bench) -> Mapping[Limit, Sequence[str]]:
         found: dict[Limit, Sequence[str]] = {}
         for limit in choices.limits(bench):
-            estimated = _OF_ESTIMATORS.get(limit.name)
-            found[limit] = [n for n, chain in bench.chains.items() if estimated is None or _provides(chain, estimated)]
+            value = _OF_ESTIMATORS.get(limit.name)
+            provided = {n: [getattr(s, "provides", ()) for s in c.stages.values()] for n, c in bench.chains.items()}
+            found[limit] = [n for n, values in provided.items() if value is None or any(value in x for x in values)]
         return found
 
     requirements = staticmethod(choices.requirements)  # pyright: ignore[reportAssignmentType]
@@ -306,10 +307,6 @@ def _scale_rate(
     other = truth["rotation_rad_s"] if not assumed else torch.full_like(truth["rotation_rad_s"], assumed)
     own = found.rate(duration_s)
     return (other if own is None else torch.where(own > 0, own, other)).expand(count)
-
-
-def _provides(chain: Any, value: str) -> bool:
-    return any(value in getattr(stage, "provides", ()) for stage in chain.stages.values())
 
 
 def _looks_for_centre(bench: Bench) -> bool:

@@ -68,10 +68,22 @@ def choices(bench: Bench) -> list[Choice]:
     kernels = {f"gridding, {taps} taps": Gridding(taps=taps) for taps in (2, 3, 4, 5, 6, 7, 8)}
     transforms = [
         *(
-            Alternative(f"{kind} interpolation", _resampling(kind), None, "the edge of the Doppler band")
-            for kind in _KINDS
+            Alternative(
+                f"{kind} interpolation",
+                {"transform": {"kind": "resampling", "interpolation": kind}},
+                None,
+                "the edge of the Doppler band",
+            )
+            for kind in ("linear", "spline")
         ),
-        *(Alternative(name, _gridding(one), _aliased(one)) for name, one in kernels.items()),
+        *(
+            Alternative(
+                name,
+                {"transform": {"kind": "gridding", "taps": one.taps, "eps": None, "oversampling": None}},
+                _aliased(one),
+            )
+            for name, one in kernels.items()
+        ),
         Alternative("the sum itself", {"transform": {"kind": "explicit_sum"}}, {}),
     ]
     lever, off_cell = _levers(bench)
@@ -100,17 +112,6 @@ def _order(order: int, bench: Bench) -> Alternative:
         about = (world.pulses / radar.prf_hz, omega, across, radar.wavelength_m)
         lost = {"peak_loss_db": order_loss_db(k, order, *about)}
     return Alternative(f"order {order}", {"order": order}, lost, "higher orders", f"warp of order {order}")
-
-
-_KINDS = ("linear", "spline")
-
-
-def _resampling(interpolation: str) -> dict[str, Any]:
-    return {"transform": {"kind": "resampling", "interpolation": interpolation}}
-
-
-def _gridding(one: Gridding) -> dict[str, Any]:
-    return {"transform": {"kind": "gridding", "taps": one.taps, "eps": None, "oversampling": None}}
 
 
 def _aliased(one: Gridding) -> dict[str, float]:
