@@ -102,15 +102,15 @@ class Trace(Shown):
             neutral where the estimate was not used.
     """
 
-    inputs: dict[str, Signal]
-    outputs: dict[str, Signal]
-    estimates: dict[str, Estimate]
-    values: dict[str, Tensor]
-    seconds: dict[str, float]
-    bytes: dict[str, int]
-    neutral: dict[str, Tensor] = field(default_factory=dict)
-    doubtful: dict[str, Tensor] = field(default_factory=dict)
-    arguments: dict[str, Mapping[str, Tensor]] = field(default_factory=dict)
+    inputs: Mapping[str, Signal]
+    outputs: Mapping[str, Signal]
+    estimates: Mapping[str, Estimate]
+    values: Mapping[str, Tensor]
+    seconds: Mapping[str, float]
+    bytes: Mapping[str, int]
+    neutral: Mapping[str, Tensor] = field(default_factory=dict)
+    doubtful: Mapping[str, Tensor] = field(default_factory=dict)
+    arguments: Mapping[str, Mapping[str, Tensor]] = field(default_factory=dict)
 
     @property
     def signal(self) -> Signal:
@@ -177,6 +177,24 @@ class _Known:
         if estimate is None or key not in estimate.neutral or self.values[source] is not estimate.value[key]:
             return None
         return estimate, key
+
+
+@dataclass
+class _Log:
+    """Record of a run that becomes its Trace."""
+
+    inputs: dict[str, Signal] = field(default_factory=dict)
+    outputs: dict[str, Signal] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+    bytes: dict[str, int] = field(default_factory=dict)
+    neutral: dict[str, Tensor] = field(default_factory=dict)
+    doubtful: dict[str, Tensor] = field(default_factory=dict)
+    arguments: dict[str, Mapping[str, Tensor]] = field(default_factory=dict)
+
+    def trace(self, known: _Known) -> Trace:
+        """The trace of the run, with these values and estimates."""
+        parts = {name: getattr(self, name) for name in ("seconds", "bytes", "neutral", "doubtful", "arguments")}
+        return Trace(self.inputs, self.outputs, known.estimates, known.values, **parts)
 
 
 class Chain(Shown, nn.Module):
@@ -302,9 +320,9 @@ class Chain(Shown, nn.Module):
             ValueError: If a value of a given Estimate does not begin with the trial dimensions.
         """
         signal, known = self._start(x, given)
-        log = Trace({}, {}, known.estimates, known.values, {}, {})
+        log = _Log()
         self._run(list(self.stages), signal, known, log)
-        return log
+        return log.trace(known)
 
     def rerun(self, trace: Trace, start: str, stop: str | None = None, given: Given | None = None) -> Signal:
         """Repeat consecutive stages on the signal that a trace holds before the first of them.
@@ -343,16 +361,12 @@ class Chain(Shown, nn.Module):
         """
         part, known = self._part(trace, start, None, given)
         before = [name for name in trace.inputs if name not in part]
-        inputs, outputs, arguments = (
-            {name: table[name] for name in before} for table in (trace.inputs, trace.outputs, trace.arguments)
-        )
-        neutral, doubtful = (
-            {key: mask for key, mask in table.items() if key.partition(".")[0] in before}
-            for table in (trace.neutral, trace.doubtful)
-        )
-        log = Trace(inputs, outputs, known.estimates, known.values, {}, {}, neutral, doubtful, arguments)
+        log = _Log({name: trace.inputs[name] for name in before}, {name: trace.outputs[name] for name in before})
+        log.arguments |= {name: trace.arguments[name] for name in before}
+        for here, there in ((log.neutral, trace.neutral), (log.doubtful, trace.doubtful)):
+            here |= {key: mask for key, mask in there.items() if key.partition(".")[0] in before}
         self._run(part, trace.inputs[start], known, log)
-        return log
+        return log.trace(known)
 
     def _start(self, x: Recording | Signal, given: Given | None) -> tuple[Signal, _Known]:
         """The signal of a run, and the values that are known before it."""
@@ -387,7 +401,7 @@ class Chain(Shown, nn.Module):
             )
         return part, known
 
-    def _run(self, names: list[str], signal: Signal, known: _Known, log: Trace | None = None) -> Signal:
+    def _run(self, names: list[str], signal: Signal, known: _Known, log: _Log | None = None) -> Signal:
         timed = log is not None and not torch.compiler.is_dynamo_compiling()
         for name in names:
             stage = self.stages[name]
@@ -400,8 +414,7 @@ class Chain(Shown, nn.Module):
                     signal = self._step(name, stage, signal, arguments, known, origins)
             if log is not None:
                 if timed:
-                    if signal.data.is_cuda:
-                        torch.cuda.synchronize(signal.data.device)
+                    _synchronise(signal.data)
                     log.seconds[name] = time.perf_counter() - began
                 log.inputs[name], log.outputs[name] = entered, signal
                 log.bytes[name] = signal.data.numel() * signal.data.element_size()
@@ -496,3 +509,8 @@ def _check_member(name: str, stage: object) -> None:
         raise TypeError(f"stage {name!r} must be a torch.nn.Module, such as a Stage, got {got}")
     if hasattr(nn.ModuleDict(), name) or "." in name:
         raise ValueError(f"a stage cannot be called {name!r}, which torch.nn.ModuleDict reserves; choose another name")
+
+
+def _synchronise(x: Tensor) -> None:
+    if x.is_cuda:
+        torch.cuda.synchronize(x.device)
