@@ -170,6 +170,9 @@ def by_blocks(
     def into(part: slice) -> None:
         done[part.start] = work(part)
 
+    if len(parts) == 1 and not gradients:
+        with torch.no_grad():
+            return work(slice(None))
     if gradients:
         for part in parts:
             into(part)
