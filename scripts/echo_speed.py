@@ -19,7 +19,8 @@ from torchsar.core import Draws
 from torchsar.echo import simulate
 from torchsar.metrics import error_db
 from torchsar.radar import LinearFM, StripmapRadar
-from torchsar.scene import AlwaysLit, Beam, Dwell, Speckle, StripmapWorld
+from torchsar.scene import AlwaysLit, Dwell, Speckle, StripmapWorld
+from torchsar.scene.strip import Beam
 
 
 def measure(beam: Beam, targets: int, pulses: int, samples: int, repeats: int = 3) -> tuple[float, float, float]:

@@ -10,7 +10,8 @@ import torch
 from torchsar.compensate import PointDoppler, doppler_assess, doppler_at
 from torchsar.compensate.point import peak_time_s
 from torchsar.core import Draws, Outcome, Signal
-from torchsar.echo import simulate, target_energy
+from torchsar.echo import simulate
+from torchsar.echo.strip import target_energy
 from torchsar.focus import OmegaK
 from torchsar.metrics import reference_doppler_std_hz, tone_frequency_bound_hz
 from torchsar.radar import LinearFM, StripmapRadar

@@ -19,7 +19,8 @@ from torchsar.compensate.radial.trajectory import (
 from torchsar.core import Axis, Estimate, Outcome
 from torchsar.focus import compress_sweeps
 from torchsar.radar import sweep_middles
-from torchsar.scene import Polynomial, Scatterers, displacement_m
+from torchsar.scene import Polynomial, Scatterers
+from torchsar.scene.vibration import displacement_m
 
 RADAR = table1()
 

@@ -8,7 +8,9 @@ import torch
 from torch import Tensor
 
 from torchsar.radar import LIGHT_M_S, TriangularLadar
-from torchsar.scene import Points, Polynomial, RetroAndBrokenLine, Scatterers, Sinusoid, SweepError, displacement_m
+from torchsar.scene import Points, Polynomial, RetroAndBrokenLine, Scatterers, Sinusoid
+from torchsar.scene.ladar import SweepError
+from torchsar.scene.vibration import displacement_m
 
 DOUBLE = torch.complex128
 THREE = Points([-0.06, 0.0, 0.06], [1.0, 1.5, 2.0], [0.7, 1.0, 0.7])

@@ -18,15 +18,14 @@ from torchsar.scene import (
     Fleet,
     GroundMovers,
     KSea,
-    Movers,
     MovingPoints,
-    MovingScene,
     OrbitTransmit,
     Pattern,
     PolynomialTransmit,
     Ship,
     TaylorRange,
 )
+from torchsar.scene.movers import Movers, MovingScene
 
 C = 3e8
 SPEED, NEAR = 300.0, 5000.0

@@ -12,12 +12,12 @@ from torch import Tensor
 
 from tests.echo.ladars import COMMON, DOUBLE, THREE, direct_sweeps, table1, table4
 from torchsar.core import Draws, Recording
-from torchsar.echo import PolynomialSweepError, SinusoidSweepError, calibration_channel, ladar_echo, simulate_ladar
+from torchsar.echo import PolynomialSweepError, SinusoidSweepError, ladar_echo, simulate_ladar
+from torchsar.echo.sweep_error import calibration_channel
 from torchsar.radar import TriangularLadar
 from torchsar.scene import (
     CalibrationFibre,
     EverySample,
-    Extremes,
     LadarWorld,
     LetterE,
     LinearInSweep,
@@ -32,8 +32,9 @@ from torchsar.scene import (
     Scatterers,
     Sinusoid,
     Speckle,
-    displacement_m,
 )
+from torchsar.scene.ladar_range import Extremes
+from torchsar.scene.vibration import displacement_m
 
 FAST = (Polynomial([5.0, 100.0]),)
 

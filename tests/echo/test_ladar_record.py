@@ -21,7 +21,8 @@ from tests.echo.ladars import (
     unit_retro,
 )
 from torchsar.core import Draws
-from torchsar.echo import PolynomialSweepError, SinusoidSweepError, ladar_echo, ladar_record, simulate_ladar_record
+from torchsar.echo import PolynomialSweepError, SinusoidSweepError, ladar_echo, simulate_ladar_record
+from torchsar.echo.ladar_record import ladar_record
 from torchsar.echo.sweep_error import wound_turns
 from torchsar.radar import TriangularLadar
 from torchsar.scene import (
@@ -37,8 +38,8 @@ from torchsar.scene import (
     RetroAndBrokenLine,
     Scatterers,
     Sinusoid,
-    displacement_m,
 )
+from torchsar.scene.vibration import displacement_m
 
 COMPLEX4 = table4(detection="complex")
 

@@ -16,7 +16,6 @@ from torchsar.radar import LIGHT_M_S, AntennaPath, InverseRadar, frequency_sampl
 from torchsar.scene import (
     CircularPath,
     Flight,
-    GridGround,
     Navigation,
     Offset,
     PathWorld,
@@ -163,10 +162,7 @@ def test_a_strip_has_a_constant_window_and_records_what_it_holds() -> None:
 
 
 def test_heights_of_the_ground() -> None:
-    level = torch.tensor([[0.0, 2.0, 4.0], [10.0, 12.0, 14.0]], dtype=F64)
-    ground = GridGround(level, 0.0, -5.0, 5.0)
     x, y = torch.tensor([0.0, 2.5, 5.0, 9.0], dtype=F64), torch.tensor([-5.0, 0.0, 2.5, 50.0], dtype=F64)
-    torch.testing.assert_close(ground.height_m(x, y), torch.tensor([0.0, 7.0, 13.0, 14.0], dtype=F64))
     tilted = PlaneGround(torch.tensor([1.0, 2.0], dtype=F64), 0.5).height_m(x, y)
     torch.testing.assert_close(tilted[1], 2 + 0.5 * x)
 
@@ -195,7 +191,6 @@ def test_gradients_in_positions_and_amplitudes() -> None:
         (lambda: PathWorld(POINTS, AIRCRAFT, snr_db=math.nan), "snr_db must be a finite number"),
         (lambda: PathWorld(POINTS, AIRCRAFT, snr_db=torch.zeros(2)), "one for each of the 3 trials"),
         (lambda: PathWorld(POINTS, AIRCRAFT, beam=SideBeam(0.0)), "between 0 and 180 degrees"),
-        (lambda: PathWorld(POINTS, AIRCRAFT, ground=GridGround(torch.zeros(1, 3), 0.0, 0.0, 1.0)), "at least 2 x 2"),
         (
             lambda: PathWorld(POINTS, Flight(AIRCRAFT.nominal, Sway(z=[VibrationSpectrum(torch.ones(2), 1.0, 2.0)]))),
             "rms_m of VibrationSpectrum must be a number or one for each of the 3 trials",

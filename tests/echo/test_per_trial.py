@@ -31,20 +31,16 @@ from torchsar.echo import (
     PeriodicJitter,
     PhaseSinusoid,
     PhaseWalk,
-    PolynomialDrift,
     PolynomialSweepError,
     Quantiser,
     RepeatedLines,
-    SinusoidDrift,
     SinusoidSweepError,
     SynchronisationError,
     Tone,
-    WalkDrift,
     WhitePhase,
     WideInterferer,
     bistatic_echo,
     ladar_echo,
-    sea_echo,
     simulate,
     simulate_bistatic,
     simulate_ladar,
@@ -53,32 +49,28 @@ from torchsar.echo import (
     simulate_turntable,
     smooth_response,
 )
+from torchsar.echo.sea import sea_echo
 from torchsar.radar import InverseRadar, Orbit, seen_point
 from torchsar.scene import (
     Aircraft,
     Antenna,
     BandLimited,
-    Bend,
     BistaticWorld,
     CalibrationFibre,
     CircularPath,
     Dechirped,
     Dwell,
     EverySample,
-    Extremes,
     Fleet,
     Flight,
-    GridGround,
     GroundMovers,
     ImageReflectivity,
     Jitter,
     KSea,
     LadarWorld,
     LetterE,
-    LitPoints,
     LogAmplitude,
     MeasuredTrack,
-    Movers,
     MovingPoints,
     Navigation,
     Offset,
@@ -94,7 +86,6 @@ from torchsar.scene import (
     QuadraticInSweep,
     RandomPoints,
     RandomWalk,
-    RangeHistory,
     RetroAndBrokenLine,
     Satellite,
     Scatterers,
@@ -107,10 +98,11 @@ from torchsar.scene import (
     StraightPath,
     StripmapWorld,
     Sway,
-    Tones,
     TurntableWorld,
     VibrationSpectrum,
 )
+from torchsar.scene.fluctuation import Tones
+from torchsar.scene.movers import Bend, Movers
 from torchsar.study.names import factories
 
 DOUBLE = torch.complex128
@@ -252,11 +244,6 @@ def channel_impairment(error: Any, draws: Draws) -> Outputs:
     return bistatic(BistaticWorld(MOVING, Pattern()), draws, tested=error)
 
 
-def phase_drift(drift: Any, draws: Draws) -> Outputs:
-    error = SynchronisationError([drift, WalkDrift(0.1)], [WalkDrift(1e-10)])
-    return bistatic(BistaticWorld(MOVING, Pattern()), draws, tested=error)
-
-
 def impairment(tested: Any, draws: Draws) -> Outputs:
     return stripmap(StripmapWorld(Speckle(9, 10.0, 60.0), snr_db=20.0), draws, tested=tested)
 
@@ -359,6 +346,16 @@ IMPAIRMENTS = (
     PhaseWalk,
     PhaseSinusoid,
 )
+
+CLOCKS = {
+    "phase_rad": ([0.1, 0.2], [0.0, 1.0], [-1.0, 0.5]),
+    "phase_sinusoid_rad": (0.1, 0.3, 1.0),
+    "phase_walk_rad": (0.1, 0.3, 1.0),
+    "delay_s": ([1e-10, 1e-9], [0.0, 1e-9], [-2e-9, 0.0]),
+    "delay_sinusoid_s": (1e-10, 1e-9, 2e-9),
+    "sinusoid_hz": (0.1, 5.0, 20.0),
+    "direct_snr_db": LEVELS,
+}
 
 CASES = (
     Case(
@@ -615,15 +612,12 @@ CASES = (
         },
         (channel_impairment,),
     ),
-    Case(PolynomialDrift, {}, {"coefficients": ([0.1, 0.2], [0.0, 1.0], [-1.0, 0.5])}, (phase_drift,)),
     Case(
-        SinusoidDrift,
-        {"amplitude": 0.3, "frequency_hz": 2.0},
-        {"amplitude": (0.0, 0.3, 1.0), "frequency_hz": (0.0, 5.0, 20.0), "start_rad": (0.0, 1.0, 3.0)},
-        (phase_drift,),
+        SynchronisationError,
+        {"phase_sinusoid_rad": 0.1, "phase_walk_rad": 0.1},
+        CLOCKS,
+        (channel_impairment,),
     ),
-    Case(WalkDrift, {}, {"step": (0.0, 0.1, 1.0)}, (phase_drift,)),
-    Case(SynchronisationError, {"phase_rad": (WalkDrift(0.1),)}, {"direct_snr_db": LEVELS}, (channel_impairment,)),
     Case(
         ChannelImbalance,
         {"gain": (1.0, 1.2), "phase_rad": (0.0, 0.3)},
@@ -703,27 +697,12 @@ CASES = (
 
 # impairments that a config names by factories
 RESPONSE = dict.fromkeys(("quadratic_rad", "cubic_rad", "ripple_rad", "slope_db"), (0.0, 0.5, 2.0))
-CLOCKS = {
-    "phase_rad": ([0.1, 0.2], [0.0, 1.0], [-1.0, 0.5]),
-    "phase_sinusoid_rad": (0.1, 0.3, 1.0),
-    "phase_walk_rad": (0.1, 0.3, 1.0),
-    "delay_s": ([1e-10, 1e-9], [0.0, 1e-9], [-2e-9, 0.0]),
-    "delay_sinusoid_s": (1e-10, 1e-9, 2e-9),
-    "sinusoid_hz": (0.1, 5.0, 20.0),
-    "direct_snr_db": LEVELS,
-}
 FACTORIES = (
     Case(
         smooth_response,  # pyright: ignore[reportArgumentType]
         {"ripple_rad": 0.3},
         {**RESPONSE, "ripple_cycles": (1.0, 2.5, 4.0), "amplitude_ripple_db": (0.0, 1.0, 2.0)},
         (impairment,),
-    ),
-    Case(
-        factories.clock_errors,  # pyright: ignore[reportArgumentType]
-        {"phase_sinusoid_rad": 0.1, "phase_walk_rad": 0.1},
-        CLOCKS,
-        (channel_impairment,),
     ),
     Case(
         factories.drift,  # pyright: ignore[reportArgumentType]
@@ -748,11 +727,8 @@ FACTORIES = (
 # parameters annotated with Tensor that have no case, and plain numbers, each with the reason
 NOT_PER_TRIAL = {
     (MeasuredTrack, "time_s"): "times of measurement, which all trials share",
-    (GridGround, "level_m"): "heights of one ground, which all trials share",
-    **{(GridGround, n): "place of one ground, which all trials share" for n in ("x0_m", "y0_m", "step_m")},
     (Navigation, "rate_hz"): "decides how many records there are",
     (PathWorld, "window_range_m"): "a setting of the receiver, which all trials share",
-    (LitPoints, "processed_hz"): "Doppler band of a receiver, which all trials share",
     (Aircraft, "spacing_m"): "decides how many scatterers there are",
     (Aircraft, "length_m"): "decides how many scatterers there are",
     (Aircraft, "width_m"): "decides how many scatterers there are",
@@ -760,14 +736,6 @@ NOT_PER_TRIAL = {
     (KSea, "cell_m"): "decides how many numbers of texture are drawn",
     (ImageReflectivity, "margin_s"): "decides how many cells there are",
     (WideInterferer, "bandwidth_hz"): "decides how many numbers are drawn",
-    (Extremes, "range_m"): "the reach of a whole batch, from which phases are predicted",
-    (Extremes, "across_m"): "the reach of a whole batch",
-    (Extremes, "velocity_m_s"): "the reach of a whole batch",
-    (Extremes, "velocity_change_m_s"): "the reach of a whole batch",
-    (Extremes, "acceleration_m_s2"): "the reach of a whole batch",
-    (Extremes, "jerk_m_s3"): "the reach of a whole batch",
-    (Extremes, "displacement_m"): "the reach of a whole batch",
-    (RangeHistory, "start_s"): "start of the slow-time axis, which all trials share",
     **{(StraightPath, name): "the nominal path, which all trials share" for name in ("start_m", "velocity_m_s")},
     **{
         (CircularPath, name): "the nominal path, which all trials share"

@@ -9,8 +9,8 @@ import torch
 
 from tests.helpers import kondor_radar, small_radar
 from torchsar.core import Draws
-from torchsar.echo import SimulatedPairs, simulate, stripmap_echo
-from torchsar.echo.stripmap import _line_length, lit_power, path_geometry
+from torchsar.echo import simulate, stripmap_echo
+from torchsar.echo.strip import _line_length, lit_power, path_geometry
 from torchsar.metrics import error_db
 from torchsar.scene import (
     AlwaysLit,
@@ -124,16 +124,6 @@ def test_the_parabola_predicts_what_it_neglects():
         < math.pi / 4
         < Parabola().neglected_phase_rad(radar, 20e3, 0.5)
     )
-
-
-def test_pairs_are_the_same_in_any_batch_size():
-    world = StripmapWorld(RandomPoints(2, 10.0, 40.0), snr_db=5.0)
-    by_two = list(SimulatedPairs(small_radar(), world, 12, 60, seed=4, count=5, batch=2))
-    assert [r.signal.data.shape[0] for r, _ in by_two] == [2, 2, 1] and len(
-        SimulatedPairs(small_radar(), world, 12, 60, 4, 5, 2)
-    ) == 3
-    one_by_one = torch.cat([r.signal.data for r, _ in SimulatedPairs(small_radar(), world, 12, 60, seed=4, count=5)])
-    torch.testing.assert_close(torch.cat([r.signal.data for r, _ in by_two]), one_by_one, rtol=1e-4, atol=1e-6)
 
 
 def test_what_no_radar_can_record_is_refused():

@@ -11,11 +11,12 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws
-from torchsar.echo import sea_echo, simulate_bistatic
-from torchsar.echo.sea import _Light, _Lines
+from torchsar.echo import simulate_bistatic
+from torchsar.echo.sea import _Light, _Lines, sea_echo
 from torchsar.radar import LIGHT_M_S, BistaticRadar, LinearFM
 from torchsar.radar.bistatic import receive_range
-from torchsar.scene import BandLimited, BistaticWorld, ImageReflectivity, KSea, Pattern, Sea
+from torchsar.scene import BandLimited, BistaticWorld, ImageReflectivity, KSea, Pattern
+from torchsar.scene.sea import Sea
 
 
 def geo_radar(**changes: Any) -> BistaticRadar:

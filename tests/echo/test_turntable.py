@@ -27,9 +27,8 @@ from torchsar.scene import (
     Together,
     TurntableWorld,
     UniformStartPhase,
-    displacement_m,
-    start_phase_rad,
 )
+from torchsar.scene.vibration import displacement_m, start_phase_rad
 
 DOUBLE = torch.complex128
 SMALL = RandomPoints(9, 0.2, 0.05)
@@ -528,7 +527,7 @@ REFUSED = {
     "bad coefficient": (lambda: Polynomial([1.0, math.inf]), "coefficient 2 of a translation must be a finite number"),
     "aircraft": (
         lambda: Aircraft(spacing_m=0.0),
-        "spacing_m of an aircraft must be a positive number of metres, got 0",
+        "spacing_m of an aircraft must be a positive number, got 0",
     ),
     "heading": (lambda: Aircraft(heading_deg=math.nan), "heading_deg of an aircraft must be a finite number"),
     "rows": (lambda: SpreadRows(300, 1, 0.5, 0.3, 1e-3), "rows must lie in 1..256, the number of range cells"),

@@ -16,7 +16,7 @@ from tests.table.functions import ENTRIES, Entry, _signal, ramp, samples
 from tests.table.stages import RADAR
 from torchsar import compensate, core, echo, focus, multichannel, radar, repair, scene
 from torchsar.core import Signal
-from torchsar.echo.stripmap import Placed
+from torchsar.echo.strip import Placed
 from torchsar.focus.stored_omega_k import InvertibleOmegaK
 
 DOUBLE, F64 = torch.complex128, torch.float64

@@ -9,7 +9,7 @@ import torch
 
 from tests.multichannel.helpers import azimuth_echo, compressed_echo, published_radar
 from torchsar.core import Axis, Draws, Outcome, Signal
-from torchsar.echo import sea_echo
+from torchsar.echo.sea import sea_echo
 from torchsar.metrics.bistatic_bounds import bistatic_bounds, radial_velocity_bound_m_s
 from torchsar.multichannel import (
     AlongTrackAutofocus,

@@ -24,8 +24,9 @@ from torchsar.scene import (
     RetroAndBrokenLine,
     Sinusoid,
     VibrationSpectrum,
-    drawn_motion,
 )
+from torchsar.scene.fluctuation import drawn_motion
+from torchsar.study.names.factories import measured_track
 
 
 def test_the_letter() -> None:
@@ -126,7 +127,7 @@ def written(folder: Path, suffix: str, time: np.ndarray, track: np.ndarray) -> P
 def test_measured_tracks_from_files(tmp_path: Path, suffix: str) -> None:
     time = np.arange(50) * 1e-4
     track = 1e-5 * np.sin(2 * np.pi * 300 * time)
-    found = MeasuredTrack.from_file(written(tmp_path, suffix, time, track))
+    found = measured_track(str(written(tmp_path, suffix, time, track)))
     at = np.linspace(0, time[-1], 77).reshape(7, 11)
     np.testing.assert_allclose(found.displacement_m(torch.tensor(at)).numpy(), CubicSpline(time, track)(at), atol=1e-17)
 
@@ -146,7 +147,7 @@ def test_unsuitable_measured_tracks_are_refused(tmp_path: Path) -> None:
         ("none.csv", "none.csv: no such file"),
     ):
         with pytest.raises(ValueError, match=message):
-            MeasuredTrack.from_file(tmp_path / name)
+            measured_track(str(tmp_path / name))
     track = MeasuredTrack(torch.arange(4, dtype=torch.float64), torch.zeros(2, 4, dtype=torch.float64))
     assert track.displacement_m(torch.zeros(3, 5, dtype=torch.float64)).shape == (2, 3, 5)
     with pytest.raises(ValueError, match="must lie within -1 to 4 s, one step beyond its ends, got 2 to 9 s"):
@@ -164,7 +165,7 @@ def test_unsuitable_measured_tracks_are_refused(tmp_path: Path) -> None:
             r"without must be a tuple of the effects to leave out \(residual_video, hyperbola, flight\)",
         ),
         (lambda: LinearInSweep("flight"), "must be a tuple of the effects"),  # type: ignore[arg-type]
-        (lambda: CalibrationFibre(0.0), "longer than 0 s"),
+        (lambda: CalibrationFibre(0.0), "delay_s of a calibration fibre must be a positive number"),
         (lambda: PathFluctuation(1e-6, 100.0, 10.0), "0 < lowest_hz <= highest_hz"),
         (lambda: VibrationSpectrum(1e-6, 1.0, 10.0, count=0), "count of sinusoids"),
         (

@@ -16,7 +16,6 @@ from torchsar.scene import (
     ExactRange,
     Fleet,
     GroundMovers,
-    Movers,
     MovingPoints,
     OrbitTransmit,
     Pattern,
@@ -24,6 +23,7 @@ from torchsar.scene import (
     Ship,
     TaylorRange,
 )
+from torchsar.scene.movers import Movers
 
 RADAR = BistaticRadar(
     1.25e9, LinearFM(50e6, 10e-6), 60e6, 180.0, 300.0, 5000.0, channel_m=(-0.8, 0.1, 0.75), wave_speed_m_s=3e8

@@ -10,7 +10,9 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws
-from torchsar.scene import ImageReflectivity, KSea, gamma_from_normal
+from torchsar.io.plain import read_array
+from torchsar.scene import ImageReflectivity, KSea
+from torchsar.scene.sea import gamma_from_normal
 
 
 def grid(n: int = 40, step_m: float = 20.0) -> Tensor:
@@ -108,7 +110,7 @@ def test_images_come_from_files(tmp_path):
     np.savez(tmp_path / "single.npz", sea=image)
     np.savez(tmp_path / "two.npz", sea=image, complex=np.sqrt(image) * 1j)
     for path, key in (("one.npy", None), ("single.npz", None), ("two.npz", "sea"), ("two.npz", "complex")):
-        sea = ImageReflectivity.from_file(tmp_path / path, 100.0, 100.0, key, power_db=3.0)
+        sea = ImageReflectivity(read_array(tmp_path / path, key), 100.0, 100.0, power_db=3.0)
         torch.testing.assert_close(sea.intensity, torch.as_tensor(image))
         assert sea.power_db == 3.0
     (tmp_path / "text.npy").write_text("no array")
@@ -129,7 +131,7 @@ def test_images_come_from_files(tmp_path):
         ("text.npy", None, ValueError, "text.npy must be a numpy archive .* but it is a file of another kind"),
     ):
         with pytest.raises(error, match=sentence):
-            ImageReflectivity.from_file(tmp_path / path, 1.0, 1.0, key)
+            read_array(tmp_path / path, key)
 
 
 @pytest.mark.parametrize(
@@ -158,7 +160,7 @@ def test_impossible_seas_are_refused(changes, sentence):
         ([[1.0, math.nan]], 10.0, "intensity of a surface must be finite and not negative"),
         ([[0.0, 0.0]], 10.0, "intensity of a surface must be finite and not negative"),
         ([1.0, 2.0], 10.0, r"an array of shape \(..., azimuth, range\), got shape \(2,\)"),
-        ([[1.0]], 0.0, "azimuth_extent_m of an image must be a positive number of metres, got 0.0"),
+        ([[1.0]], 0.0, "azimuth_extent_m of an image must be a positive number, got 0.0"),
     ],
 )
 def test_impossible_images_are_refused(image, extent, sentence):

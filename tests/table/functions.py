@@ -35,7 +35,7 @@ from torchsar.compensate.doppler import lag_products
 from torchsar.compensate.group import RangeGroup
 from torchsar.compensate.point import peak_time_s
 from torchsar.core import Draws, Estimate, Signal, Stage
-from torchsar.echo.turntable import fast_time_axis
+from torchsar.echo.dechirped import fast_time_axis
 from torchsar.focus.reference import matched_reference
 from torchsar.multichannel.body import find_body
 from torchsar.multichannel.velocity.along_track import along_track_velocity

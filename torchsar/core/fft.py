@@ -290,3 +290,21 @@ def _blocks(x: Tensor, dim: int, block_bytes: int) -> Iterator[tuple[slice, ...]
             (slice(trial, trial + 1), slice(None), slice(first, first + width))
             for first in range(0, x.shape[-1], width)
         )
+
+
+def smooth_length(n: int) -> int:
+    """Return the least FFT length of at least n without prime factors above 5.
+
+    Args:
+        n: Least length.
+
+    Returns:
+        Length, at most 2 n.
+
+    Raises:
+        ValueError: If n is below 1.
+    """
+    if n < 1:
+        raise ValueError(f"an FFT has at least one sample, got the length {n}")
+    # numbers without prime factors above 5 divide a high power of 30
+    return next(k for k in range(n, 2 * n + 1) if pow(30, k.bit_length(), k) == 0)

@@ -7,21 +7,21 @@ true values of the impairment. The recording may be simulated or recorded. A par
 """
 
 from torchsar.echo.bistatic import bistatic_echo, simulate_bistatic
-from torchsar.echo.channel_errors import ChannelErrors, PolynomialDrift, SinusoidDrift, SynchronisationError, WalkDrift
+from torchsar.echo.channel_errors import ChannelErrors, SynchronisationError
 from torchsar.echo.channels import ChannelImbalance
+from torchsar.echo.dechirped import dechirped_echo
 from torchsar.echo.interference import Quantiser, Tone, WideInterferer
 from torchsar.echo.jitter import PeriodicJitter
-from torchsar.echo.ladar import ladar_echo, range_model_error_db, simulate_ladar
-from torchsar.echo.ladar_record import ladar_record, simulate_ladar_record
-from torchsar.echo.lines import CorruptedNumbers, LostGaps, LostLines, RepeatedLines
-from torchsar.echo.pairs import SimulatedPairs
+from torchsar.echo.ladar import ladar_echo, simulate_ladar
+from torchsar.echo.ladar_record import simulate_ladar_record
+from torchsar.echo.lines import CorruptedNumbers, LostGaps, LostLines, LostPulses, RepeatedLines
 from torchsar.echo.path import PathError, path_echo, simulate_path
 from torchsar.echo.pulse_phase import PhaseSinusoid, PhaseWalk, WhitePhase
+from torchsar.echo.recorded import Impairment, apply_impairments
 from torchsar.echo.response import ChannelResponse, smooth_response
-from torchsar.echo.sea import sea_echo
-from torchsar.echo.stripmap import Impairment, apply_impairments, simulate, stripmap_echo, target_energy
-from torchsar.echo.sweep_error import PolynomialSweepError, SinusoidSweepError, calibration_channel
-from torchsar.echo.turntable import LostPulses, dechirped_echo, simulate_turntable, turntable_echo
+from torchsar.echo.strip import simulate, stripmap_echo
+from torchsar.echo.sweep_error import PolynomialSweepError, SinusoidSweepError
+from torchsar.echo.turntable import simulate_turntable, turntable_echo
 
 __all__ = [
     "ChannelErrors",
@@ -36,27 +36,19 @@ __all__ = [
     "PeriodicJitter",
     "PhaseSinusoid",
     "PhaseWalk",
-    "PolynomialDrift",
     "PolynomialSweepError",
     "Quantiser",
     "RepeatedLines",
-    "SimulatedPairs",
-    "SinusoidDrift",
     "SinusoidSweepError",
     "SynchronisationError",
     "Tone",
-    "WalkDrift",
     "WhitePhase",
     "WideInterferer",
     "apply_impairments",
     "bistatic_echo",
-    "calibration_channel",
     "dechirped_echo",
     "ladar_echo",
-    "ladar_record",
     "path_echo",
-    "range_model_error_db",
-    "sea_echo",
     "simulate",
     "simulate_bistatic",
     "simulate_ladar",
@@ -65,7 +57,6 @@ __all__ = [
     "simulate_turntable",
     "smooth_response",
     "stripmap_echo",
-    "target_energy",
     "turntable_echo",
 ]
 __dir__ = __all__.copy

@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis, Draws, Recording, Signal, Truth, gathered_checks, per_trial, real_dtype, unit_phasor
-from torchsar.echo.pulsed import echo_spectrum
+from torchsar.core import Draws, Recording, Truth, gathered_checks, per_trial, unit_phasor
+from torchsar.core.fft import smooth_length
+from torchsar.echo.recorded import Impairment, noise, recorded
 from torchsar.echo.sea import sea_echo
-from torchsar.echo.stripmap import Impairment
+from torchsar.echo.sums import blocks, echo_spectrum
 from torchsar.radar import BistaticRadar
-from torchsar.scene import BandLimited, BistaticWorld, ExactRange, Gate, Movers, ReceiveRange, TransmitRange
+from torchsar.scene import BandLimited, BistaticWorld, ExactRange
+from torchsar.scene.bistatic import Gate, ReceiveRange, TransmitRange
+from torchsar.scene.movers import Movers
 from torchsar.scene.trials import refuse_other_trials, with_dims
 
 Kind = Literal["compressed", "full"]
-# phase tables of a block of pulses, about the cache of a processor
-_TABLE_BYTES = 8 << 20
 _EXACT = ExactRange()
 
 
@@ -73,15 +73,15 @@ def bistatic_echo(
     """
     time_s = radar.pulse_axis(n_pulse).values(movers.u_r_m_s.device)
     if n_range is None:
-        blocks = _pulse_blocks(n_pulse, 16 * radar.channels * movers.amplitude.numel())
-        parts = [_Lines.of(movers, radar, time_s[pulses], gate, receive, transmit).peaks(dtype) for pulses in blocks]
+        parts = [
+            _Lines.of(movers, radar, time_s[pulses], gate, receive, transmit).peaks(dtype)
+            for pulses in blocks(n_pulse, 16 * radar.channels * movers.amplitude.numel())
+        ]
         return torch.cat(parts, -1)
     grid = _Grid.of(radar, n_range, kind)
     spectrum = torch.fft.fftshift(grid.spectrum(radar, time_s.device)).to(dtype)
     parts = []
-    for pulses in _pulse_blocks(
-        n_pulse, 16 * radar.channels * max(grid.n_fft, movers.amplitude.shape[-1])
-    ):  # independent of the number of trials, so that sums round equally in any batch
+    for pulses in blocks(n_pulse, 16 * radar.channels * max(grid.n_fft, movers.amplitude.shape[-1])):
         block = _Lines.of(movers, radar, time_s[pulses], gate, receive, transmit).spectrum(grid, radar, dtype)
         parts.append(torch.fft.ifft(torch.fft.ifftshift(block * spectrum, dim=-1))[..., :n_range])
     return torch.cat(parts, -2)
@@ -141,29 +141,13 @@ class _Grid:
     def of(radar: BistaticRadar, n_range: int, kind: Kind) -> _Grid:
         """The shortest fast FFT in which echoes do not wrap."""
         margin = max(32, n_range // 8) if kind == "compressed" else radar.pulse.n_samples(radar.sampling_hz)
-        need = n_range + 2 * margin
-        return _Grid(n_range, next(n for n in range(need, 2 * need) if _smooth(n)), margin, kind)
+        return _Grid(n_range, smooth_length(n_range + 2 * margin), margin, kind)
 
     def spectrum(self, radar: BistaticRadar, device: torch.device) -> Tensor:
         """Spectrum of the pulse, or of its compressed response, (n_fft,) in FFT order."""
         if self.kind == "full":
             return radar.pulse.spectrum(self.n_fft, radar.sampling_hz, device)
         return radar.band_weights(self.n_fft, device).to(torch.complex128)
-
-
-def _smooth(n: int) -> bool:
-    """Whether a number has no prime factor above 5."""
-    for p in (2, 3, 5):
-        while n % p == 0:
-            n //= p
-    return n == 1
-
-
-def _pulse_blocks(n_pulse: int, bytes_per_pulse: int) -> Iterator[slice]:
-    """Blocks of pulses whose tables fit the cache."""
-    height = max(1, min(n_pulse, _TABLE_BYTES // max(1, bytes_per_pulse)))
-    for first in range(0, n_pulse, height):
-        yield slice(first, min(first + height, n_pulse))
 
 
 @gathered_checks()
@@ -234,24 +218,14 @@ def simulate_bistatic(
     if world.sea is not None:
         gate: Any = world.gate  # sea_echo rejects other gates
         sea = sea_echo(world.sea, radar, n_pulse, n_range, gate, draws.part("sea"), dtype, device)
-        echo = echo + (
-            _received(sea[..., None], transmit_m, radar, kind)[..., 0]
-            if n_range is None
-            else _received(sea, transmit_m, radar, kind)
-        )
-    trials = np.broadcast_shapes(echo.shape[: -len(axes)], () if draws.trials is None else (len(draws.trials),))
-    echo = echo.expand(*trials, *echo.shape[-len(axes) :])
+        lines = _received(sea[..., None] if n_range is None else sea, transmit_m, radar, kind)
+        echo = echo + (lines[..., 0] if n_range is None else lines)
     std = _noise_std(radar, world, kind, echo)
+    noisy = echo
+    if world.snr_db is not None:
+        noisy = echo + noise(draws, "echo.bistatic.noise", [axis.n for axis in axes], std, dtype, echo.device)
     values = _truths(movers, radar, transmit_m, std)
-    clean = Recording(Signal(echo, axes), radar)
-    recording = (
-        clean if world.snr_db is None else Recording(Signal(echo + _noise(std, axes, draws, dtype), axes), radar)
-    )
-    impairment_truth: dict[str, Tensor] = {}
-    for name, impairment in (impairments or {}).items():
-        recording, added = impairment(recording, draws.part(name))
-        impairment_truth.update({f"{name}.{key}": value for key, value in added.items()})
-    return recording, Truth({**values, **impairment_truth}, clean)
+    return recorded(noisy, echo, axes, radar, values, impairments, draws, numbered=False)
 
 
 def _movers(
@@ -264,10 +238,8 @@ def _movers(
     movers = world.scene.movers(radar, draws).each(lambda x: x.to(device))
     if not movers.u_r_m_s.shape[-1]:
         raise ValueError("the scene holds no target; give it at least one, or scene=None for the sea alone")
-    slowest, nearest = (
-        float(radar.speed_m_s - movers.u_a_m_s.detach().max()),
-        float(movers.closest_m(radar).detach().min()),
-    )
+    slowest = float(radar.speed_m_s - movers.u_a_m_s.detach().max())
+    nearest = float(movers.closest_m(radar).detach().min())
     if not slowest > 0:
         raise ValueError(
             f"a target moves along track at {radar.speed_m_s - slowest:g} m/s, as fast as the "
@@ -278,22 +250,14 @@ def _movers(
             f"a target lies at a closest range of {nearest:g} m; range_m counts from the "
             f"reference range of {radar.reference_range_m:g} m and must leave a positive range"
         )
-    off, width = (
-        movers.range_m.detach().abs().flatten(0, -2).amin(0)
-        if movers.range_m.ndim > 1
-        else movers.range_m.detach().abs(),
-        (n_range or 0) * radar.range_step_m,
-    )
+    off, width = movers.range_m.detach().abs(), (n_range or 0) * radar.range_step_m
+    off = off.flatten(0, -2).amin(0) if off.ndim > 1 else off
     outside = (off > 1.5 * width).nonzero()[:, 0].tolist()
     if n_range is not None and outside:
-        far = (
-            f"targets {outside} (counted from 0) with up to {float(off.max()):g} m"
-            if len(outside) > 1
-            else f"target {outside[0]} (counted from 0) with {float(off.max()):g} m"
-        )
         raise ValueError(
             f"range_m of a target, which counts from the reference range, must lie within 1.5 times the length of "
-            f"the range axis of {width:g} m, got {far}; correct it, or record longer range lines (n_range)"
+            f"the range axis of {width:g} m, got target {', '.join(map(str, outside))} (counted from 0) with "
+            f"{float(off.max()):g} m; correct it, or record longer range lines (n_range)"
         )
     return movers
 
@@ -360,12 +324,6 @@ def _noise_std(radar: BistaticRadar, world: BistaticWorld, kind: Kind, like: Ten
     # compression raises the signal-to-noise ratio by the number of samples of the pulse
     gain = radar.pulse.n_samples(radar.sampling_hz) if kind == "full" else 1
     return torch.sqrt(gain * 10 ** (-per_trial(world.snr_db, 0, like) / 10))
-
-
-def _noise(std: Tensor, axes: tuple[Axis, ...], draws: Draws, dtype: torch.dtype) -> Tensor:
-    """Circular Gaussian noise of a standard deviation (...,)."""
-    unit = draws.normal("echo.bistatic.noise", [axis.n for axis in axes], dtype, std.device)
-    return unit * std.to(real_dtype(dtype))[(...,) + (None,) * len(axes)]
 
 
 def _truths(movers: Movers, radar: BistaticRadar, transmit_m: Tensor, noise_std: Tensor) -> dict[str, Tensor]:

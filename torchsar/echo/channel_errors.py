@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Protocol
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Recording, Signal, real_dtype, unit_phasor
+from torchsar.echo.recorded import noise, with_samples
 from torchsar.radar import BistaticRadar
-from torchsar.scene.trials import refuse_other_trials, refuse_unless_finite, stacked, with_dims
-
-PerChannel = Sequence[Tensor | float] | Tensor
+from torchsar.scene.trials import finite_numbers, refuse_other_trials, stacked, with_dims
 
 
 def delayed(signal: Signal, delay_s: Tensor, radar: BistaticRadar) -> Signal:
@@ -45,6 +43,7 @@ def _refuse_delay(recording: Recording, what: str) -> None:
 
 
 @dataclass(frozen=True)
+@finite_numbers("channels")
 class ChannelErrors:
     """Impairment: phase, gain and delay of each channel, for signal and noise.
 
@@ -63,13 +62,9 @@ class ChannelErrors:
             channel, or delays are given for azimuth-only data.
     """
 
-    phase_rad: PerChannel | None = None
-    gain_db: PerChannel | None = None
-    delay_s: PerChannel | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("phase_rad", "gain_db", "delay_s"):
-            refuse_unless_finite(f"{name} of channels", getattr(self, name))
+    phase_rad: Sequence[Tensor | float] | Tensor | None = None
+    gain_db: Sequence[Tensor | float] | Tensor | None = None
+    delay_s: Sequence[Tensor | float] | Tensor | None = None
 
     def _values(self, name: str, channels: int, device: torch.device) -> Tensor:
         """Values of a parameter for all channels, zero where it is not given, (..., channel)."""
@@ -96,137 +91,18 @@ class ChannelErrors:
         factor = unit_phasor(phase / (2 * math.pi), signal.data.dtype) * (10 ** (gain / 20)).to(
             real_dtype(signal.data.dtype)
         )
-        impaired = signal.with_data(signal.data * factor[(..., *tail)])
-        return replace(recording, signal=impaired), {"phase_rad": phase, "gain_db": gain, "delay_s": delay}
-
-
-class Drift(Protocol):
-    """Error of a clock as a function of slow time."""
-
-    def values(self, time_s: Tensor, draws: Draws) -> Tensor:
-        """Return the clock error at each pulse.
-
-        Args:
-            time_s: Slow time in seconds, zero at the middle pulse, shape (pulse,), float64.
-            draws: Random draws.
-
-        Returns:
-            Clock error, in radians for a phase and in seconds for a delay, shape (..., pulse),
-            float64.
-        """
-        ...
+        impaired = with_samples(recording, signal.data * factor[(..., *tail)])
+        return impaired, {"phase_rad": phase, "gain_db": gain, "delay_s": delay}
 
 
 @dataclass(frozen=True)
-class PolynomialDrift:
-    """Polynomial drift of a clock, c0 + c1 t + c2 t^2 + ..., with the slow time t in seconds.
-
-    Args:
-        coefficients: c0, c1, ... in rad, rad/s, ... for a phase and in s, s/s, ... for a delay;
-            each a number or one value per trial.
-
-    Raises:
-        ValueError: If a coefficient is not finite.
-    """
-
-    coefficients: Sequence[Tensor | float]
-
-    def __post_init__(self) -> None:
-        refuse_unless_finite("coefficients of a drift", self.coefficients)
-
-    def values(self, time_s: Tensor, draws: Draws) -> Tensor:
-        """Return the polynomial drift at each pulse.
-
-        Args:
-            time_s: Slow time in seconds, shape (pulse,), float64.
-            draws: Random draws, which are not used.
-
-        Returns:
-            Drift in radians or seconds, as the coefficients, shape (..., pulse), float64.
-        """
-        total = torch.zeros_like(time_s)
-        for c in reversed(self.coefficients):
-            total = total * time_s + with_dims(c, time_s.ndim, time_s)
-        return total
-
-
-@dataclass(frozen=True)
-class SinusoidDrift:
-    """Sinusoidal drift of a clock, amplitude sin(2 pi frequency_hz t + start_rad) at slow time t.
-
-    Args:
-        amplitude: Amplitude, in radians for a phase and in seconds for a delay.
-        frequency_hz: Frequency in hertz.
-        start_rad: Phase at slow time zero in radians, None for a random phase in each trial.
-
-    Raises:
-        ValueError: If a number is not finite.
-    """
-
-    amplitude: Tensor | float
-    frequency_hz: Tensor | float
-    start_rad: Tensor | float | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("amplitude", "frequency_hz", "start_rad"):
-            refuse_unless_finite(f"{name} of a drift", getattr(self, name))
-
-    def values(self, time_s: Tensor, draws: Draws) -> Tensor:
-        """Return the sinusoidal drift at each pulse.
-
-        Args:
-            time_s: Slow time in seconds, shape (pulse,), float64.
-            draws: Random draws of the start phase.
-
-        Returns:
-            Drift in radians or seconds, as the amplitude, shape (..., pulse), float64.
-        """
-        start = (
-            2 * math.pi * draws.uniform("echo.drift.sinusoid")
-            if self.start_rad is None
-            else torch.as_tensor(self.start_rad, dtype=torch.float64)
-        ).to(time_s.device)[..., None]
-        amplitude, frequency = (with_dims(v, 1, time_s) for v in (self.amplitude, self.frequency_hz))
-        return amplitude * torch.sin(2 * math.pi * frequency * time_s + start)
-
-
-@dataclass(frozen=True)
-class WalkDrift:
-    """Random walk of a clock with normal steps from pulse to pulse, zero at the middle pulse.
-
-    Args:
-        step: Standard deviation of a step, in radians for a phase and in seconds for a delay.
-
-    Raises:
-        ValueError: If the standard deviation is negative or not finite.
-    """
-
-    step: Tensor | float
-
-    def __post_init__(self) -> None:
-        refuse_unless_finite("step of a drift", self.step, 0.0)
-
-    def values(self, time_s: Tensor, draws: Draws) -> Tensor:
-        """Draw the random walk of the clock.
-
-        Args:
-            time_s: Slow time in seconds, shape (pulse,), float64.
-            draws: Random draws.
-
-        Returns:
-            Drift in radians or seconds, as the step, shape (..., pulse), float64.
-        """
-        unit = draws.normal("echo.drift.walk", (time_s.numel(),))
-        walk = (with_dims(self.step, 1, unit) * unit).cumsum(-1)
-        return (walk - walk[..., time_s.numel() // 2, None]).to(time_s.device)
-
-
-@dataclass(frozen=True)
+@finite_numbers("clock errors", phase_walk_rad=0.0)
 class SynchronisationError:
     """Impairment: phase and delay of every pulse due to clocks that drift apart.
 
-    The errors are common to all channels. The data are delayed without a change of their carrier
-    phases and then multiplied by exp(j phase).
+    Both are polynomials and sinusoids of slow time, which is zero at the middle pulse; the phase
+    also walks at random from pulse to pulse. The errors are common to all channels. The data are
+    delayed without a change of their carrier phases and then multiplied by exp(j phase).
 
     From the direct path, from the transmitter straight to the receiver, these errors can be
     measured. The recording gets aux `direct_path`, shape (..., pulse, direct_samples): the
@@ -235,31 +111,32 @@ class SynchronisationError:
     sampling_hz. The truth holds `phase_rad` and `delay_s`, shape (..., pulse) each, float64.
 
     Args:
-        phase_rad: Drifts whose sum is the phase in radians.
-        delay_s: Drifts whose sum is the delay in seconds, later positive.
+        phase_rad: Polynomial of the phase in rad, rad/s, ...; each a number or one value per trial.
+        phase_sinusoid_rad: Amplitude of a sinusoidal phase in radians, with a random start.
+        phase_walk_rad: Standard deviation of the steps of a random walk, zero at the middle pulse,
+            in radians.
+        delay_s: Polynomial of the delay in s, s/s, ..., later positive.
+        delay_sinusoid_s: Amplitude of a sinusoidal delay in seconds, with a random start.
+        sinusoid_hz: Frequency of the sinusoids in hertz.
         direct_snr_db: Peak power of the direct path over the noise variance per sample in decibels,
             None for no noise.
         direct_samples: Number of samples of the direct path, at least 8.
 
     Raises:
-        TypeError: If a single drift is given instead of a list.
-        ValueError: If direct_snr_db is not finite or direct_samples is below 8; when applied, if
-            delays are given for azimuth-only data or exceed a quarter of the samples of the direct
-            path.
+        ValueError: If a number is not finite or direct_samples is below 8; when applied, if delays
+            are given for azimuth-only data or exceed a quarter of the samples of the direct path.
     """
 
-    phase_rad: Sequence[Drift] = ()
-    delay_s: Sequence[Drift] = ()
+    phase_rad: Sequence[Tensor | float] | None = None
+    phase_sinusoid_rad: Tensor | float = 0.0
+    phase_walk_rad: Tensor | float = 0.0
+    delay_s: Sequence[Tensor | float] | None = None
+    delay_sinusoid_s: Tensor | float = 0.0
+    sinusoid_hz: Tensor | float = 0.5
     direct_snr_db: Tensor | float | None = 40.0
     direct_samples: int = 64
 
     def __post_init__(self) -> None:
-        if hasattr(self.phase_rad, "values") or hasattr(self.delay_s, "values"):
-            raise TypeError(
-                f"phase_rad and delay_s must be lists of drifts, got {self.phase_rad!r} and {self.delay_s!r}; "
-                "put a single drift in brackets"
-            )
-        refuse_unless_finite("direct_snr_db", self.direct_snr_db)
         if not self.direct_samples >= 8:
             raise ValueError(
                 f"a direct path needs at least 8 samples per pulse, got direct_samples={self.direct_samples}"
@@ -269,18 +146,45 @@ class SynchronisationError:
         refuse_other_trials(self, draws, recording)
         signal, radar = recording.signal, recording.radar
         axis = signal.axis("pulse")
+        time_s = axis.values(signal.data.device)
         phase, delay = (
-            _total(drifts, axis.values(signal.data.device), draws.part(name)).expand(*signal.trials, axis.n)
-            for name, drifts in (("phase", self.phase_rad), ("delay", self.delay_s))
+            x.expand(*signal.trials, axis.n)
+            for x in (
+                self._phase_rad(time_s, draws.part("phase")),
+                self._drift(self.delay_s, self.delay_sinusoid_s, time_s, draws.part("delay")),
+            )
         )
         tail = (None,) * (-signal.dim("pulse") - 1)
-        if self.delay_s:
+        # azimuth-only data have no range cells and admit no delay
+        if self.delay_s or isinstance(self.delay_sinusoid_s, Tensor) or self.delay_sinusoid_s:
             _refuse_delay(recording, "a synchronisation error")
             signal = delayed(signal, delay[..., None, :], radar)
         turn = unit_phasor(phase / (2 * math.pi), signal.data.dtype)
-        impaired = signal.with_data(signal.data * turn[(..., None, slice(None), *tail)])
-        aux = {**recording.aux, "direct_path": self._direct_path(turn, delay, radar, draws)}
-        return replace(recording, signal=impaired, aux=aux), {"phase_rad": phase, "delay_s": delay}
+        direct = self._direct_path(turn, delay, radar, draws)
+        impaired = with_samples(recording, signal.data * turn[(..., None, slice(None), *tail)], direct_path=direct)
+        return impaired, {"phase_rad": phase, "delay_s": delay}
+
+    def _phase_rad(self, time_s: Tensor, draws: Draws) -> Tensor:
+        """Phase at each pulse, (..., pulse)."""
+        unit = draws.part("2").normal("echo.drift.walk", (time_s.numel(),))
+        walk = (with_dims(self.phase_walk_rad, 1, unit) * unit).cumsum(-1)
+        walk = (walk - walk[..., time_s.numel() // 2, None]).to(time_s.device)
+        return self._drift(self.phase_rad, self.phase_sinusoid_rad, time_s, draws) + walk
+
+    def _drift(
+        self,
+        coefficients: Sequence[Tensor | float] | None,
+        amplitude: Tensor | float,
+        time_s: Tensor,
+        draws: Draws,
+    ) -> Tensor:
+        """Polynomial and sinusoid of slow time at each pulse, (..., pulse)."""
+        total = torch.zeros_like(time_s)
+        for c in reversed(coefficients or [0.0]):
+            total = total * time_s + with_dims(c, 1, time_s)
+        start = (2 * math.pi * draws.part("1").uniform("echo.drift.sinusoid")).to(time_s.device)[..., None]
+        amplitude, frequency = (with_dims(v, 1, time_s) for v in (amplitude, self.sinusoid_hz))
+        return total + amplitude * torch.sin(2 * math.pi * frequency * time_s + start)
 
     def _direct_path(self, turn: Tensor, delay_s: Tensor, radar: BistaticRadar, draws: Draws) -> Tensor:
         """Direct signal of each pulse, (..., pulse, direct_samples)."""
@@ -299,12 +203,7 @@ class SynchronisationError:
         line = turn[..., None] * line
         if self.direct_snr_db is None:
             return line
-        noise = draws.normal("echo.direct_path.noise", line.shape[-2:], line.dtype, line.device)
-        std = 10 ** (-with_dims(self.direct_snr_db, 2, line) / 20)
-        return line + (std.to(real_dtype(line.dtype)) if isinstance(std, Tensor) else std) * noise
-
-
-def _total(drifts: Sequence[Drift], time_s: Tensor, draws: Draws) -> Tensor:
-    """Sum of drifts, each of which draws from an address of its own, (..., pulse)."""
-    values = [drift.values(time_s, draws.part(str(i))) for i, drift in enumerate(drifts)]
-    return sum(values, torch.zeros_like(time_s))
+        std = torch.as_tensor(
+            10 ** (-with_dims(self.direct_snr_db, 0, line) / 20), dtype=torch.float64, device=line.device
+        )
+        return line + noise(draws, "echo.direct_path.noise", line.shape[-2:], std, line.dtype, line.device)

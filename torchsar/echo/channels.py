@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Recording
-from torchsar.scene.trials import refuse_other_trials, refuse_unless_finite, stacked
+from torchsar.echo.recorded import with_samples
+from torchsar.scene.trials import finite_numbers, refuse_other_trials, stacked
 
 
 @dataclass(frozen=True)
+@finite_numbers("channels")
 class ChannelImbalance:
     """Impairment: gain and phase of receiver channels that record the lines in turn.
 
@@ -33,10 +35,6 @@ class ChannelImbalance:
     gain: Sequence[Tensor | float] | Tensor
     phase_rad: Sequence[Tensor | float] | Tensor
 
-    def __post_init__(self) -> None:
-        refuse_unless_finite("gain of channels", self.gain)
-        refuse_unless_finite("phase_rad of channels", self.phase_rad)
-
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
         refuse_other_trials(self, draws, recording)
         data = recording.signal.data
@@ -48,4 +46,4 @@ class ChannelImbalance:
         factor = torch.polar(*torch.broadcast_tensors(gain, phase))
         channel = torch.arange(data.shape[-2], device=data.device) % gain.shape[-1]
         impaired = data * factor[..., channel, None].to(data.dtype)
-        return replace(recording, signal=recording.signal.with_data(impaired)), {"gain": gain, "phase_rad": phase}
+        return with_samples(recording, impaired), {"gain": gain, "phase_rad": phase}

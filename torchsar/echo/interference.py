@@ -8,16 +8,18 @@ hold the interferers that were added before.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Recording, cis, per_trial, real_dtype, reduced_turns
-from torchsar.scene.trials import positive, refuse_other_trials, refuse_unless, refuse_unless_finite, with_dims
+from torchsar.echo.recorded import with_samples
+from torchsar.scene.trials import finite_numbers, refuse_other_trials, refuse_unless, with_dims
 
 
 @dataclass(frozen=True)
+@finite_numbers("a tone", share=None)
 class Tone:
     """Impairment: a tone that is added to randomly chosen lines.
 
@@ -50,8 +52,6 @@ class Tone:
 
     def __post_init__(self) -> None:
         _check_share(self.share)
-        for name in ("over_signal_db", "frequency_hz", "drift_hz", "wander_hz", "rate_hz_s"):
-            refuse_unless_finite(f"{name} of a tone", getattr(self, name))
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
         refuse_other_trials(self, draws, recording)
@@ -88,6 +88,7 @@ class Tone:
 
 
 @dataclass(frozen=True)
+@finite_numbers("an interferer", share=None, bandwidth_hz="positive")
 class WideInterferer:
     """Impairment: band-limited noise on randomly chosen lines, independent from line to line.
 
@@ -115,12 +116,6 @@ class WideInterferer:
 
     def __post_init__(self) -> None:
         _check_share(self.share)
-        refuse_unless_finite("over_signal_db of an interferer", self.over_signal_db)
-        refuse_unless_finite("frequency_hz of an interferer", self.frequency_hz)
-        if not self.bandwidth_hz > 0:
-            raise ValueError(
-                f"an interferer's bandwidth_hz must be positive, got {self.bandwidth_hz}; for a single tone use Tone"
-            )
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
         refuse_other_trials(self, draws, recording)
@@ -145,6 +140,7 @@ class WideInterferer:
 
 
 @dataclass(frozen=True)
+@finite_numbers("a converter", rms_levels="positive")
 class Quantiser:
     """Impairment: an I/Q converter behind an automatic gain control, without dither.
 
@@ -168,7 +164,6 @@ class Quantiser:
     def __post_init__(self) -> None:
         if not 1 <= self.bits <= 16:
             raise ValueError(f"a converter needs 1 to 16 bits, got bits={self.bits}")
-        refuse_unless("rms_levels of a converter must be above 0", self.rms_levels, positive)
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
         refuse_other_trials(self, draws, recording)
@@ -184,10 +179,7 @@ class Quantiser:
         levels = (2 * torch.floor(parts * gain[..., None, None, None] / 2) + 1).clamp(-top, top)
         clipped = (levels.abs() == top).to(torch.float64).mean((-3, -2, -1))
         data = torch.view_as_complex((levels / gain[..., None, None, None]).contiguous())
-        return replace(recording, signal=recording.signal.with_data(data)), {
-            "gain": gain.to(torch.float64),
-            "extreme_share": clipped,
-        }
+        return with_samples(recording, data), {"gain": gain.to(torch.float64), "extreme_share": clipped}
 
 
 def _check_share(share: Tensor | float) -> None:
@@ -210,6 +202,4 @@ def _add(recording: Recording, wave: Tensor, lines: Tensor, over_signal_db: Tens
     power = (data.abs().square().mean(-1) * lines).sum(-1) / lines.sum(-1)
     ratio = 10 ** (per_trial(over_signal_db, 0, data) / 10)
     amplitude = torch.sqrt(power.to(torch.float64) * ratio).to(power.dtype)
-    return replace(
-        recording, signal=recording.signal.with_data(data + wave * (amplitude[..., None] * lines)[..., None])
-    )
+    return with_samples(recording, data + wave * (amplitude[..., None] * lines)[..., None])

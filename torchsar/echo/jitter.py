@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from torchsar.core import Draws, Recording, linear_phasor, real_dtype, unit_phasor
-from torchsar.scene.trials import refuse_other_trials, refuse_unless_finite, stacked, with_dims
+from torchsar.core import Draws, Recording, linear_phasor, unit_phasor
+from torchsar.echo.recorded import noise, with_samples
+from torchsar.scene.trials import finite_numbers, refuse_other_trials, stacked, with_dims
 
 
 def sample_unevenly(x: Tensor, offset_samples: Tensor) -> Tensor:
@@ -33,6 +34,7 @@ def sample_unevenly(x: Tensor, offset_samples: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
+@finite_numbers()
 class PeriodicJitter:
     """Impairment: sample n of every line is taken at the instant n + e[n mod M], with M offsets e.
 
@@ -66,9 +68,6 @@ class PeriodicJitter:
                 "jitter needs at least one entry of offset_samples and a value of pilot_samples of 0 or more, "
                 f"got offset_samples={self.offset_samples} and pilot_samples={self.pilot_samples}"
             )
-        refuse_unless_finite("pilot_cycles", self.pilot_cycles)
-        refuse_unless_finite("pilot_snr_db", self.pilot_snr_db)
-        refuse_unless_finite("offset_samples", self.offset_samples)
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
         refuse_other_trials(self, draws, recording)
@@ -80,10 +79,8 @@ class PeriodicJitter:
                 f"jitter offsets {offsets.tolist()} make sample instants coincide or cross; keep "
                 "neighbouring offsets less than one sample apart"
             )
-        impaired = replace(recording, signal=recording.signal.with_data(sample_unevenly(data, offsets)))
-        if self.pilot_samples:
-            impaired = replace(impaired, aux={**impaired.aux, "pilot": self.pilot(offsets, draws, data)})
-        return impaired, {
+        pilot = {"pilot": self.pilot(offsets, draws, data)} if self.pilot_samples else {}
+        return with_samples(recording, sample_unevenly(data, offsets), **pilot), {
             "offset_samples": offsets,
             "pilot_cycles": torch.as_tensor(self.pilot_cycles, dtype=torch.float64),
         }
@@ -104,6 +101,7 @@ class PeriodicJitter:
         tone = unit_phasor(turns + draws.uniform("pilot.phase", device=like.device)[..., None], like.dtype)
         if self.pilot_snr_db is None:
             return tone
-        noise = draws.normal("pilot.noise", (self.pilot_samples,), like.dtype, like.device)
-        std = 10 ** (-with_dims(self.pilot_snr_db, 1, offsets) / 20)
-        return tone + (std.to(real_dtype(like.dtype)) if isinstance(std, Tensor) else std) * noise
+        std = torch.as_tensor(
+            10 ** (-with_dims(self.pilot_snr_db, 0, offsets) / 20), dtype=torch.float64, device=like.device
+        )
+        return tone + noise(draws, "pilot.noise", (self.pilot_samples,), std, like.dtype, like.device)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -11,26 +11,16 @@ from torch import Tensor
 
 from torchsar.core import Draws, Recording, Truth, gathered_checks, host_largest, linear_phasor, real_dtype, unit_phasor
 from torchsar.echo.ladar_course import LadarCourse, calibration_aux, hand_over
-from torchsar.echo.stripmap import Impairment
+from torchsar.echo.recorded import Impairment, noise
+from torchsar.echo.sums import blocks, line_sum, line_tables
 from torchsar.radar import TriangularLadar, sweep_middles
-from torchsar.scene import (
-    EverySample,
-    Fidelity,
-    LadarWorld,
-    LinearInSweep,
-    Motion,
-    RangeHistory,
-    Scatterers,
-    SweepError,
-)
+from torchsar.scene import EverySample, LadarWorld, LinearInSweep, Motion, Scatterers
+from torchsar.scene.ladar import SweepError
+from torchsar.scene.ladar_range import Fidelity, RangeHistory
 
-# phase tables of a block of pulses, about the cache of a processor
-_TABLE_BYTES = 8 << 20
 _DEFAULT = LinearInSweep()
 # sign of the sweep rate in up-sweeps and down-sweeps
 _RATES = (1.0, -1.0)
-# periods and samples of a sweep, by choice, on which the error of a range model is evaluated
-_ERROR_PERIODS, _ERROR_SAMPLES = 256, 16
 
 
 def ladar_echo(
@@ -114,8 +104,8 @@ def range_model_error_db(
         ValueError: If the beam never illuminates the scatterer.
     """
     pulse = radar.sweep_axes(n_period)[1]
-    middle_s = sweep_middles(radar, pulse)[:, :: max(1, n_period // _ERROR_PERIODS)]
-    u = radar.fast_time_axis().values()[:: max(1, radar.sweep_samples // _ERROR_SAMPLES)]
+    middle_s = sweep_middles(radar, pulse)[:, :: max(1, n_period // 256)]
+    u = radar.fast_time_axis().values()[:: max(1, radar.sweep_samples // 16)]
     time_s = middle_s[..., None] + u
     exact, model = (RangeHistory(scatterers, radar, motion, pulse.start, without) for without in ((), fidelity.without))
     if isinstance(fidelity, EverySample):
@@ -225,32 +215,26 @@ def _sum_of_lines(
     u = radar.fast_time_axis().values(lines.start.device)
     amplitude = s.amplitude[..., None, None, :].to(dtype) * lit
     table = None if error is None else _error_table(error, s, u, radar, dtype)
-    parts = []
-    for pulses in _pulse_blocks(lines.start.shape[-2], 2 * s.range_m.shape[-1] * 16 * 64):
+    n, parts = len(u), []
+    for pulses in blocks(lines.start.shape[-2], 2 * s.range_m.shape[-1] * 16 * 64):
         weight = unit_phasor(lines.start[..., pulses, :], dtype) * amplitude[..., pulses, :]
         turns = lines.slope[..., pulses, :] / radar.sample_rate_hz
-        total = _line_sum(weight, turns, len(u), dtype) if table is None else _sum_with_errors(weight, turns, table)
-        parts.append(
-            total if lines.curve is None else total * unit_phasor(lines.curve[..., pulses, None] * u.square(), dtype)
-        )
+        if table is None:
+            total = line_sum(line_tables(turns, n, -(n - 1) / 2, dtype), weight, n)
+        else:
+            total = _sum_with_errors(weight, turns, table)
+        if lines.curve is not None:
+            total = total * unit_phasor(lines.curve[..., pulses, None] * u.square(), dtype)
+        parts.append(total)
     return torch.cat(parts, -2)
-
-
-def _line_sum(weight: Tensor, turns: Tensor, n: int, dtype: torch.dtype) -> Tensor:
-    """sum_m weight_m exp(2j pi turns_m i), i about the middle: (..., target) -> (..., n)."""
-    m = 2 ** round(math.log2(n) / 2)
-    fine, coarse = linear_phasor(turns, 0, m, dtype), linear_phasor(m * turns, -(n - 1) / (2 * m), -(-n // m), dtype)
-    return ((coarse * weight[..., None]).mT @ fine).flatten(-2)[..., :n]
 
 
 def _sum_with_errors(weight: Tensor, turns: Tensor, table: Tensor) -> Tensor:
     """The same with a phase table (..., 2, 1, target, n), scatterer by scatterer."""
     n, total = table.shape[-1], torch.zeros((), dtype=table.dtype, device=table.device)
     for at in range(turns.shape[-1]):
-        total = (
-            total
-            + weight[..., at, None] * linear_phasor(turns[..., at], -(n - 1) / 2, n, table.dtype) * table[..., at, :]
-        )
+        phasor = weight[..., at, None] * linear_phasor(turns[..., at], -(n - 1) / 2, n, table.dtype)
+        total = total + phasor * table[..., at, :]
     return total
 
 
@@ -269,7 +253,7 @@ def _sampled(
     u = radar.fast_time_axis().values(middle_s.device)
     amplitude = s.amplitude[..., None, None, :].to(dtype) * lit
     parts = []
-    for pulses in _pulse_blocks(middle_s.shape[-1], 16 * trials * 2 * len(u) * s.range_m.shape[-1]):
+    for pulses in blocks(middle_s.shape[-1], 16 * trials * 2 * len(u) * s.range_m.shape[-1]):
         turns = _sample_turns(history, error, middle_s[:, pulses, None] + u, u)
         parts.append((unit_phasor(turns, dtype) * amplitude[..., pulses, None, :]).sum(-1))
     return torch.cat(parts, -2)
@@ -303,13 +287,6 @@ def shared(positions: Tensor) -> Tensor:
     while positions.ndim > 1 and (positions.shape[0] == 1 or positions.stride(0) == 0):
         positions = positions[0]
     return positions
-
-
-def _pulse_blocks(n_pulse: int, bytes_per_pulse: int) -> Iterator[slice]:
-    """Blocks of pulses whose tables fit the cache."""
-    height = max(1, min(n_pulse, _TABLE_BYTES // bytes_per_pulse))
-    for first in range(0, n_pulse, height):
-        yield slice(first, min(first + height, n_pulse))
 
 
 @gathered_checks()
@@ -368,32 +345,12 @@ def simulate_ladar(
 
     level = torch.exp(course.log_amplitude(middle_s)).to(real_dtype(dtype))[..., None]
     values = course.truths(radar, world, middle_s)
-    noise = _noise(values["noise_std"], world.snr_db, (2, n_period, axes[2].n), radar, draws, dtype)
-    clean = echo_of(()) * level + noise
-    data = echo_of(course.motion) * level + noise if course.motion else clean
-    return hand_over(
-        data,
-        clean,
-        axes,
-        radar,
-        calibration_aux(radar, world, n_period, draws, dtype, device),
-        values,
-        impairments,
-        draws,
-    )
-
-
-def _noise(
-    std: Tensor,
-    snr_db: Tensor | float | None,
-    shape: tuple[int, ...],
-    radar: TriangularLadar,
-    draws: Draws,
-    dtype: torch.dtype,
-) -> Tensor | float:
-    """Circular noise, conjugated with the dechirp sign, so that both signs give conjugate data."""
-    if snr_db is None:
-        return 0.0
-    unit = draws.normal("echo.ladar.noise", shape, dtype, std.device)
-    unit = unit.conj().resolve_conj() if radar.dechirp_sign == "echo_conj_lo" else unit
-    return unit * std.to(real_dtype(dtype))[(...,) + (None,) * len(shape)]
+    clean = echo_of(()) * level
+    data = echo_of(course.motion) * level if course.motion else clean
+    if world.snr_db is not None:
+        added = noise(draws, "echo.ladar.noise", (2, n_period, axes[2].n), values["noise_std"], dtype, data.device)
+        # both signs give conjugate data
+        added = added.conj().resolve_conj() if radar.dechirp_sign == "echo_conj_lo" else added
+        clean, data = clean + added, data + added
+    aux = calibration_aux(radar, world, n_period, draws, dtype, device)
+    return hand_over(data, clean, axes, radar, aux, values, impairments, draws)

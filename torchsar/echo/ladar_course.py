@@ -7,16 +7,17 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis, Draws, Recording, Signal, Truth, per_trial
-from torchsar.echo.stripmap import Impairment, apply_impairments
+from torchsar.core import Axis, Draws, Recording, Truth, per_trial
+from torchsar.echo.recorded import Impairment, recorded, trials_of
 from torchsar.echo.sweep_error import calibration_channel
 from torchsar.radar import TriangularLadar
-from torchsar.scene import LadarWorld, Motion, Scatterers, Tones, displacement_m, drawn_motion
+from torchsar.scene import LadarWorld, Motion, Scatterers
+from torchsar.scene.fluctuation import Tones, drawn_motion
 from torchsar.scene.trials import refuse_other_trials
+from torchsar.scene.vibration import displacement_m
 
 # nodes of the interpolation between trigger times: through 16 Chebyshev nodes a sinusoid with one
 # cycle over their span is exact to 1e-14 of its amplitude
@@ -68,8 +69,7 @@ class LadarCourse:
         if not (isinstance(n_period, int) and n_period >= 1):
             raise ValueError(f"n_period must be a whole number of 1 or more periods, got {n_period}")
         refuse_other_trials(world, draws)
-        drawn = world.scene.scatterers(draws)
-        s = Scatterers(*(v.to(device) for v in (drawn.azimuth_m, drawn.range_m, drawn.amplitude)))
+        s = world.scene.scatterers(draws).to(device)
         axis = radar.sweep_axes(n_period)[1]
         span_s = n_period * axis.step
         chi = None if world.log_amplitude is None else world.log_amplitude.drawn(draws.part("log_amplitude"), span_s)
@@ -201,8 +201,6 @@ def noise_std(snr_db: Tensor | float | None, like: Tensor) -> Tensor:
 
 def _gated(s: Scatterers, gate_m: tuple[Tensor | float, Tensor | float] | None) -> Scatterers:
     """Scatterers with zero amplitude outside the gate."""
-    if not s.range_m.shape[-1]:
-        raise ValueError("the scene holds no scatterer; give it at least one")
     if gate_m is None:
         return s
     low, high = (per_trial(bound, 1, s.range_m) for bound in gate_m)
@@ -275,16 +273,8 @@ def hand_over(
     Returns:
         Recording and truth.
     """
-    tail = len(axes)
-    trials = np.broadcast_shapes(
-        data.shape[:-tail], clean.shape[:-tail], () if draws.trials is None else (len(draws.trials),)
-    )
-    data, clean = (v.expand(*trials, *v.shape[v.ndim - tail :]) for v in (data, clean))
+    trials = trials_of(draws, len(axes), data, clean)
     for name in ("velocity_m_s", "range_error_m", "range_error_up_m", "range_error_down_m", "log_amplitude"):
         if name in values:
             values[name] = values[name].expand(*trials, -1)
-    recording = Recording(Signal(data, axes), radar, aux)
-    impairment_truth: dict[str, Tensor] = {}
-    if impairments:
-        recording, impairment_truth = apply_impairments(recording, impairments, draws)
-    return recording, Truth({**values, **impairment_truth}, Recording(Signal(clean, axes), radar, aux))
+    return recorded(data, clean, axes, radar, values, impairments, draws, aux, aux, numbered=bool(impairments))

@@ -22,28 +22,15 @@ from torchsar.core import (
     reduced_turns,
 )
 from torchsar.echo.ladar import SweepLines, lit_by, refuse_beats, shared
-from torchsar.echo.ladar_course import LadarCourse, calibration_aux, hand_over, noise_std
-from torchsar.echo.stripmap import Impairment
+from torchsar.echo.ladar_course import LadarCourse, calibration_aux, hand_over
+from torchsar.echo.recorded import Impairment, noise
+from torchsar.echo.sums import blocks
 from torchsar.echo.sweep_error import wound_turns
 from torchsar.radar import TriangularLadar, sweep_middles
-from torchsar.scene import (
-    Effect,
-    EverySample,
-    LadarWorld,
-    LinearInSweep,
-    Motion,
-    QuadraticInSweep,
-    RangeHistory,
-    Scatterers,
-    SweepError,
-    displacement_m,
-)
-
-# size of a block of the record, so that its intermediates fit the cache of a processor
-_BLOCK_BYTES = 4 << 20
-# knots of the spline of the motion in a period: the error is 1e-7 of a vibration with the period of
-# the triangle, 1e-4 of one six times as fast
-_KNOTS = 64
+from torchsar.scene import EverySample, LadarWorld, LinearInSweep, Motion, QuadraticInSweep, Scatterers
+from torchsar.scene.ladar import SweepError
+from torchsar.scene.ladar_range import Effect, RangeHistory
+from torchsar.scene.vibration import displacement_m
 
 
 def ladar_record(
@@ -98,23 +85,16 @@ def ladar_record(
     scatterers = Scatterers(shared(scatterers.azimuth_m), shared(scatterers.range_m), scatterers.amplitude)
     start_s = axis.values(scatterers.range_m.device)
     paths = BlockPaths.of(scatterers, radar, start_s, n_sample, motion, without)
-    ramps = _Ramps.of(
-        radar, time.values(scatterers.range_m.device), trigger_s, 0.0 if "residual_video" in without else 0.5
-    )
+    video = 0.0 if "residual_video" in without else 0.5
+    ramps = _Ramps.of(radar, time.values(scatterers.range_m.device), trigger_s, video)
     _refuse_record(scatterers, radar, n_period, motion, without)
     parts = []
-    trials = math.prod(
-        np.broadcast_shapes(paths.start_m.shape[:-2], paths.knots.shape[:-2], scatterers.amplitude.shape[:-1])
-    )
-    height = max(1, _BLOCK_BYTES // (8 * n_sample * trials))
-    for first in range(0, n_period, height):
-        beat = _blocks(paths.part(first, first + height), ramps, scatterers.amplitude, sweep_error, dtype)
-        parts.append(
-            beat
-            if log_amplitude is None
-            else beat
-            * _level(log_amplitude, start_s[first : first + height], time.stop, n_sample).to(real_dtype(dtype))
-        )
+    trials = np.broadcast_shapes(paths.start_m.shape[:-2], paths.knots.shape[:-2], scatterers.amplitude.shape[:-1])
+    for rows in blocks(n_period, 8 * n_sample * math.prod(trials), 4 << 20):
+        beat = _blocks(paths.part(rows), ramps, scatterers.amplitude, sweep_error, dtype)
+        if log_amplitude is not None:
+            beat = beat * _level(log_amplitude, start_s[rows], time.stop, n_sample).to(real_dtype(dtype))
+        parts.append(beat)
     record = torch.cat(parts, -2)
     return record.conj().resolve_conj() if record.is_complex() and radar.dechirp_sign == "echo_conj_lo" else record
 
@@ -142,17 +122,12 @@ class _Ramps:
     def turns(self, delay: Tensor, error: SweepError | None) -> Tensor:
         """Phase of a beat of given delays in cycles, (..., pulse, n)."""
         late = torch.relu((self.middle_s - delay).abs() - self.radar.sweep_s / 2)
-        turns = (
-            delay * (self.radar.carrier_hz + self.rate * (self.middle_s - self.video * delay))
-            + self.rate * late.square()
-        )
+        turns = delay * (self.radar.carrier_hz + self.rate * (self.middle_s - self.video * delay))
+        turns = turns + self.rate * late.square()
         if error is None:
             return turns
-        return (
-            turns
-            + wound_turns(error, self.radar, self.position_s)
-            - wound_turns(error, self.radar, self.position_s - delay)
-        )
+        ends = [wound_turns(error, self.radar, at) for at in (self.position_s, self.position_s - delay)]
+        return turns + ends[0] - ends[1]
 
 
 @dataclass(frozen=True)
@@ -212,7 +187,9 @@ class BlockPaths:
         effects: tuple[Effect, ...] = ("flight", "hyperbola") if "hyperbola" in without else ("flight",)
         still = RangeHistory(scatterers, radar, (), float(start_s[0]), effects)
         first, middle, last = (still.at(then + share * length) for share in (0.0, 0.5, 1.0))
-        count = max(4, math.ceil(length / radar.period_s * _KNOTS))
+        # with 64 knots of the spline in a period the error is 1e-7 of a vibration with the period
+        # of the triangle, and 1e-4 of one six times as fast
+        count = max(4, math.ceil(length / radar.period_s * 64))
         steps = length / count * torch.arange(count + 1, dtype=torch.float64, device=start_s.device)
         knots = displacement_m(motion, then[:, None] + steps - start_s[0])
         speed = (last - first) / length + ((knots[..., -1] - knots[..., 0]) / length)[..., None]
@@ -220,35 +197,21 @@ class BlockPaths:
         bend = 2 * ((last - middle) - (middle - first)) / length**2
         lit = lit_by(scatterers, radar, start_s + length / 2)
         offsets = radar.record_axes(len(start_s), n_sample)[1].values(start_s.device)
-        return BlockPaths(
-            first,
-            (last - first) / length - bend * length,
-            bend,
-            knots,
-            shrink,
-            lit,
-            length / count,
-            offsets,
-            radar.wave_speed_m_s,
-        )
+        start_speed = (last - first) / length - bend * length
+        step_s, c = length / count, radar.wave_speed_m_s
+        return BlockPaths(first, start_speed, bend, knots, shrink, lit, step_s, offsets, c)
 
-    def part(self, first: int, last: int) -> BlockPaths:
-        """Return the range histories of consecutive blocks.
+    def part(self, rows: slice) -> BlockPaths:
+        """Return the range histories of some blocks.
 
         Args:
-            first: First block.
-            last: Block after the last one.
+            rows: The blocks.
 
         Returns:
-            Range histories of the blocks first to last - 1.
+            Their range histories.
         """
-        return replace(
-            self,
-            **{
-                name: getattr(self, name)[..., first:last, :]
-                for name in ("start_m", "speed", "bend", "knots", "shrink", "lit")
-            },
-        )
+        names = ("start_m", "speed", "bend", "knots", "shrink", "lit")
+        return replace(self, **{name: getattr(self, name)[..., rows, :] for name in names})
 
     def motion_m(self) -> Tensor:
         """Return the displacement by the motion at all samples of all blocks.
@@ -270,7 +233,7 @@ class BlockPaths:
             n).
         """
         start_m, speed, bend, shrink = (
-            v[..., target, None] for v in (self.start_m, self.speed, self.bend, self.shrink)
+            x[..., target, None] for x in (self.start_m, self.speed, self.bend, self.shrink)
         )
         range_m = start_m + self.offsets_s * (speed + bend * self.offsets_s) + motion_m
         return 2 / self.wave_speed_m_s * shrink * range_m
@@ -284,18 +247,12 @@ def _blocks(
     for target in range(paths.start_m.shape[-1]):
         turns = reduced_turns(ramps.turns(paths.delay_s(target, motion), error))
         weight = amplitude[..., target, None, None] * paths.lit[..., target, None]
-        total = total + (
-            _real_part(turns, weight, dtype)
-            if ramps.radar.detection == "real"
-            else cis((2 * math.pi * turns).to(real_dtype(dtype))) * weight.to(dtype)
-        )
+        if ramps.radar.detection == "real":  # by one cosine
+            angle = (2 * math.pi * turns + torch.angle(weight)).to(real_dtype(dtype))
+            total = total + torch.cos(angle) * weight.abs().to(real_dtype(dtype))
+        else:
+            total = total + cis((2 * math.pi * turns).to(real_dtype(dtype))) * weight.to(dtype)
     return total  # type: ignore[return-value]
-
-
-def _real_part(turns: Tensor, weight: Tensor, dtype: torch.dtype) -> Tensor:
-    """Real part of weight * exp(2j pi turns), by one cosine."""
-    angle = 2 * math.pi * turns + torch.angle(weight)
-    return torch.cos(angle.to(real_dtype(dtype))) * weight.abs().to(real_dtype(dtype))
 
 
 def _level(log_amplitude: Callable[[Tensor], Tensor], start_s: Tensor, length_s: float, n: int) -> Tensor:
@@ -309,24 +266,18 @@ def _refuse_record(
     s: Scatterers, radar: TriangularLadar, n_period: int, motion: Sequence[Motion], without: Sequence[Effect]
 ) -> None:
     """Raise ValueError for beat frequencies that a record cannot hold."""
-    middle_s = sweep_middles(radar, radar.sweep_axes(n_period)[1], s.range_m.device)
-    level = LinearInSweep(tuple(without))
-    beat = SweepLines.of(
-        RangeHistory(s, radar, motion, radar.sweep_axes(n_period)[1].start, without), level, middle_s
-    ).slope
+    pulse = radar.sweep_axes(n_period)[1]
+    middle_s = sweep_middles(radar, pulse, s.range_m.device)
+    history = RangeHistory(s, radar, motion, pulse.start, without)
+    beat = SweepLines.of(history, LinearInSweep(tuple(without)), middle_s).slope
     contributing = lit_by(s, radar, middle_s) & (s.amplitude != 0)[..., None, None, :]
     refuse_beats(beat, contributing, radar)
-    if radar.detection == "real":
-        _refuse_folding(beat.detach(), contributing)
-
-
-def _refuse_folding(beat_hz: Tensor, contributing: Tensor) -> None:
-    """Raise ValueError where beats fold at zero, as real samples have no sign of frequency."""
-    up = beat_hz * torch.tensor([1.0, -1.0], dtype=torch.float64, device=beat_hz.device)[:, None, None]
-    low, high = (
-        float(torch.where(contributing, up, math.inf).min()),
-        float(torch.where(contributing, up, -math.inf).max()),
-    )
+    if radar.detection != "real":
+        return
+    # real samples have no sign of frequency
+    up = beat.detach() * torch.tensor([1.0, -1.0], dtype=torch.float64, device=beat.device)[:, None, None]
+    low = float(torch.where(contributing, up, math.inf).min())
+    high = float(torch.where(contributing, up, -math.inf).max())
     if low <= 0 <= high:
         raise ValueError(
             f"beat frequencies of {low / 1e6:.6g} to {high / 1e6:.6g} MHz fold at zero in real samples; move the "
@@ -430,19 +381,17 @@ def simulate_ladar_record(
         "trigger_s": trigger,
     }
     clean = echo_of(())
-    noise = _record_noise(world.snr_db, tuple(axis.n for axis in axes), radar, draws, dtype, clean.device)
-    data = echo_of(course.motion) + noise if course.motion else clean + noise
+    data = echo_of(course.motion) if course.motion else clean
+    if world.snr_db is not None:
+        real = radar.detection == "real"
+        std = values["noise_std"] / (math.sqrt(2) if real else 1.0)
+        kind, shape = real_dtype(dtype) if real else dtype, [axis.n for axis in axes]
+        added = noise(draws, "echo.ladar_record.noise", shape, std, kind, clean.device)
+        added = added.conj().resolve_conj() if radar.dechirp_sign == "echo_conj_lo" and not real else added
+        clean, data = clean + added, data + added
     aux = calibration_aux(radar, world, n_period, draws, dtype, device)
-    return hand_over(
-        data,
-        clean + noise,
-        axes,
-        radar,
-        {**aux, "trigger_s": trigger} if trigger_known else aux,
-        values,
-        impairments,
-        draws,
-    )
+    aux = {**aux, "trigger_s": trigger} if trigger_known else aux
+    return hand_over(data, clean, axes, radar, aux, values, impairments, draws)
 
 
 def _block_samples(radar: TriangularLadar, block_s: float | None) -> int:
@@ -454,21 +403,3 @@ def _block_samples(radar: TriangularLadar, block_s: float | None) -> int:
             f"from one block to the next, got {length:g} s"
         )
     return round(length * radar.sample_rate_hz)
-
-
-def _record_noise(
-    snr_db: Tensor | float | None,
-    shape: tuple[int, ...],
-    radar: TriangularLadar,
-    draws: Draws,
-    dtype: torch.dtype,
-    device: torch.device,
-) -> Tensor | float:
-    """Noise of the record, zero without a signal-to-noise ratio."""
-    if snr_db is None:
-        return 0.0
-    real = radar.detection == "real"
-    unit = draws.normal("echo.ladar_record.noise", shape, real_dtype(dtype) if real else dtype, device)
-    unit = unit.conj().resolve_conj() if radar.dechirp_sign == "echo_conj_lo" and not real else unit
-    std = noise_std(snr_db, unit) / (math.sqrt(2) if real else 1.0)
-    return unit * std.to(real_dtype(dtype))[..., None, None]

@@ -9,17 +9,17 @@ never lost, since its number is the origin of the processing grid.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Recording
+from torchsar.echo.recorded import with_samples
 from torchsar.scene.trials import refuse_other_trials, refuse_unless
 
 # line number of padding at the end of a trial, by convention: no line has a negative number
 PADDING = -1
-# side data that never have one entry per line, whatever their length
-_NOT_PER_LINE = ("pilot",)
 
 
 def _numbers(recording: Recording) -> Tensor:
@@ -33,23 +33,6 @@ def _valid_count(number: Tensor, draws: Draws) -> Tensor:
     """Number of lines of each trial (trial,), or () of all where the draws have other trials."""
     have = (number != PADDING).sum(-1)
     return have if draws.trials is not None and have.shape == (len(draws.trials),) else have.min()
-
-
-def lost_count(count: int | None, fraction: Tensor | float | None, have: Tensor | int, like: Tensor) -> Tensor:
-    """Return how many lines are lost.
-
-    Args:
-        count: Number of lines, or None.
-        fraction: Fraction of the lines if count is None, a number or one value per trial.
-        have: Number of lines that there are, a number or shape (...,).
-        like: Tensor that gives the device.
-
-    Returns:
-        Number of lines, shape (...,), float64.
-    """
-    if count is not None:
-        return torch.as_tensor(count, dtype=torch.float64, device=like.device)
-    return torch.round(torch.as_tensor(fraction, dtype=torch.float64, device=like.device) * have)
 
 
 def _order(draws: Draws, purpose: str, n: Tensor, number: Tensor) -> Tensor:
@@ -84,12 +67,12 @@ def take_lines(recording: Recording, source: Tensor) -> Recording:
     data, n = recording.signal.data, recording.signal.data.shape[-2]
     present, index = source >= 0, source.clamp_min(0)
     lines = torch.where(present[..., None], data.gather(-2, index[..., None].expand(data.shape)), 0)
-    aux = dict(recording.aux)
+    aux = {}
     for name, value in {**recording.aux, "line_number": _numbers(recording)}.items():
-        if name not in _NOT_PER_LINE and value.ndim and value.shape[-1] == n:
+        if name != "pilot" and value.ndim and value.shape[-1] == n:
             moved = value.expand(source.shape).gather(-1, index)
             aux[name] = torch.where(present, moved, PADDING if name == "line_number" else 0).to(value.dtype)
-    return replace(recording, signal=recording.signal.with_data(lines), aux=aux)
+    return with_samples(recording, lines, **aux)
 
 
 def _drop(recording: Recording, lost: Tensor) -> tuple[Recording, dict[str, Tensor]]:
@@ -108,7 +91,42 @@ def _drop(recording: Recording, lost: Tensor) -> tuple[Recording, dict[str, Tens
 
 
 @dataclass(frozen=True)
-class LostLines:
+class _Lost:
+    """Base of impairments that lose lines, by their number or by a fraction."""
+
+    count: int | None = None
+    fraction: Tensor | float | None = None
+    _lost: ClassVar[str] = "lines"
+
+    def __post_init__(self) -> None:
+        if (self.count is None) == (self.fraction is None):
+            raise ValueError(
+                f"lost {self._lost} need a count or a fraction, and not both, got count={self.count}, "
+                f"fraction={self.fraction}"
+            )
+        if self.count is not None and self.count < 0:
+            raise ValueError(f"count of lost {self._lost} must be 0 or more, got {self.count}")
+        if self.fraction is not None:
+            sentence = f"fraction of lost {self._lost} must be at least 0 and below 1"
+            refuse_unless(sentence, self.fraction, lambda x: (x >= 0) & (x < 1))
+
+    def _number(self, have: Tensor, like: Tensor) -> Tensor:
+        """How many of the lines (...,) are lost, float64; ValueError if none would be left."""
+        lost = have.to(torch.float64)
+        if self.count is not None:
+            lost = torch.full_like(lost, self.count)
+        else:
+            lost = torch.round(torch.as_tensor(self.fraction, dtype=torch.float64, device=like.device) * lost)
+        if bool((lost >= have).any()):
+            worst, lines = (int(v.expand(lost.shape)[lost >= have][0]) for v in (lost, have))
+            raise ValueError(
+                f"{worst} lost {self._lost} leave nothing of a recording of {lines} {self._lost}; lose fewer"
+            )
+        return lost
+
+
+@dataclass(frozen=True)
+class LostLines(_Lost):
     """Impairment: single lines lost at random positions.
 
     The truth holds `lost`, shape (..., pulse), bool, indexed by the line number minus the number of
@@ -124,33 +142,45 @@ class LostLines:
             applied, if no line would be left or the trials of draws and recording differ.
     """
 
-    count: int | None = None
-    fraction: Tensor | float | None = None
-
-    def __post_init__(self) -> None:
-        if (self.count is None) == (self.fraction is None):
-            raise ValueError(
-                f"lost lines need a count or a fraction, and not both, got count={self.count}, fraction={self.fraction}"
-            )
-        if self.count is not None and self.count < 0:
-            raise ValueError(f"count of lost lines must be 0 or more, got {self.count}")
-        if self.fraction is not None:
-            sentence = "fraction of lost lines must be at least 0 and below 1"
-            refuse_unless(sentence, self.fraction, lambda x: (x >= 0) & (x < 1))
-
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
         refuse_other_trials(self, draws, recording)
         number = _numbers(recording)
         have = _valid_count(number, draws)
-        count = lost_count(self.count, self.fraction, have, number)
-        left = have - count
-        if bool((left <= 0).any()):
-            lost, lines = (int(v.expand(left.shape)[left <= 0][0]) for v in (count, have))
-            raise ValueError(f"{lost} lost lines leave nothing of a recording of {lines} lines; lose fewer")
+        count = self._number(have, number)
         order = _order(draws, "echo.lines.lost", have - 1, number)
         chosen = torch.arange(order.shape[-1], device=number.device) < count[..., None]
         lost = torch.zeros(number.shape, dtype=torch.bool, device=number.device)
         return _drop(recording, lost.scatter(-1, 1 + order, chosen.expand(order.shape)))
+
+
+@dataclass(frozen=True)
+class LostPulses(_Lost):
+    """Impairment: whole pulses at random positions that were not received; their samples are zero.
+
+    All other pulses keep their positions, as where a trigger counts the pulses. (`LostLines` is the
+    impairment in which later lines move up instead.) The true value `present`, shape (..., pulse),
+    bool, is true for the pulses that were received.
+
+    Args:
+        count: Number of lost pulses, fixed for all trials; None if a fraction is given.
+        fraction: Fraction of all pulses, at least 0 and below 1; None if a count is given.
+
+    Raises:
+        ValueError: Unless exactly one of count and fraction is given, and within its range. When
+            applied, if no pulse would be left or the trials of draws and recording differ.
+    """
+
+    _lost: ClassVar[str] = "pulses"
+
+    def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
+        refuse_other_trials(self, draws, recording)
+        data = recording.signal.data
+        n = data.shape[-2]
+        count = self._number(torch.as_tensor(n, device=data.device), data)
+        order = _order(draws, "echo.pulses.lost", torch.as_tensor(n), data[..., 0])
+        kept = (torch.arange(n, device=data.device) >= count[..., None]).expand(data.shape[:-1])
+        present = torch.zeros_like(kept).scatter(-1, order.expand(kept.shape), kept)
+        return with_samples(recording, data * present[..., None]), {"present": present}
 
 
 @dataclass(frozen=True)

@@ -9,15 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import Draws, Recording, Signal, Truth, gathered_checks, per_trial, unit_phasor
-from torchsar.echo.pulsed import echo_spectrum
-from torchsar.echo.stripmap import Impairment, apply_impairments
+from torchsar.core import Draws, Recording, Truth, gathered_checks, per_trial, unit_phasor
+from torchsar.echo.recorded import Impairment, noise, recorded, with_samples
+from torchsar.echo.sums import blocks, echo_spectrum
 from torchsar.radar import AntennaPath, InverseRadar, StraightTrack, frequency_samples, range_profiles
 from torchsar.scene import PathWorld, Sway
 from torchsar.scene.trials import refuse_other_trials
 
-# bytes of the tables of a block of pulses, about the cache of a processor
-_BLOCK_BYTES = 1 << 22
 # amplitude gain from which a target is lit: half power of each of two ways
 _LIT = 0.5
 
@@ -56,15 +54,12 @@ def path_echo(
         raise ValueError(f"path_echo needs points and frequencies, got {points_m.shape[-2]} and {n_frequency}")
     lead = np.broadcast_shapes(antennas.trials, points_m.shape[:-2])
     size = points_m.shape[-2] * max(1, round(2 * n_frequency**0.5)) * int(np.prod(lead)) * dtype.itemsize
-    step = max(1, _BLOCK_BYTES // size)
     out = []
-    for first in range(0, antennas.pulses, step):
-        pulses = slice(first, min(first + step, antennas.pulses))
+    for pulses in blocks(antennas.pulses, size, 1 << 22):
         delay = antennas.path_m(points_m[..., None, :, :], pulses) / radar.wave_speed_m_s
         some = weight if weight.shape[-2] == 1 else weight[..., pulses, :]
-        out.append(
-            echo_spectrum(delay, radar.carrier_hz * delay, some, n_frequency, radar.bandwidth_hz / n_frequency, dtype)
-        )
+        step_hz = radar.bandwidth_hz / n_frequency
+        out.append(echo_spectrum(delay, radar.carrier_hz * delay, some, n_frequency, step_hz, dtype))
     return torch.cat(out, -2)
 
 
@@ -145,10 +140,7 @@ def simulate_path(
         raise ValueError(f"a recording needs at least two pulses of two samples, got {n_pulse} and {n_range}")
     time_s = torch.arange(n_pulse, dtype=torch.float64, device=device) / radar.prf_hz
     flown = _Flown.of(world, draws, time_s)
-    drawn = world.scene.scatterers(draws)
-    x, y, amplitude = (v.to(device) for v in (drawn.range_m, drawn.azimuth_m, drawn.amplitude))
-    if not x.shape[-1]:
-        raise ValueError("the scene holds no scatterer; give it at least one")
+    y, x, amplitude = world.scene.scatterers(draws).to(device).tensors
     points = torch.stack(torch.broadcast_tensors(x, y, world.ground.height_m(x, y)), -1)
     gain = _gain(world, flown.true, points, time_s)
     gain = gain * _within(flown.true, points, gain, radar, n_range)
@@ -157,18 +149,10 @@ def simulate_path(
     if world.snr_db is not None:
         power = _lit_power(history.detach(), gain.detach())
         std = torch.sqrt(power / 10 ** (per_trial(world.snr_db, 0, history) / 10))
-        noise = draws.normal("noise", (n_pulse, n_range), dtype, device)
-        history = history + noise * std.to(history.real.dtype)[..., None, None]
-    trials = () if draws.trials is None else (len(draws.trials),)
-    # without random numbers the echo has no trials yet
-    data = range_profiles(history.expand(*np.broadcast_shapes(history.shape[:-2], trials), -1, -1))
+        history = history + noise(draws, "noise", (n_pulse, n_range), std, dtype, device)
+    data = range_profiles(history)
     frequency = _frequencies_hz(radar, n_range, device)
-    signal = Signal(data, radar.raw_axes(n_pulse, n_range))
-    recorded, clean = (
-        Recording(signal, radar, {"frequency_hz": frequency, **path.side_data()})
-        for path in (flown.recorded, flown.true)
-    )
-    recording, true_values = apply_impairments(recorded, impairments or {}, draws)
+    aux, clean_aux = ({"frequency_hz": frequency, **path.side_data()} for path in (flown.recorded, flown.true))
     values = {
         **flown.truth(),
         "azimuth_m": y,
@@ -177,7 +161,8 @@ def simulate_path(
         "amplitude": amplitude,
         "noise_std": std,
     }
-    return recording, Truth({**values, **true_values}, clean)
+    axes = radar.raw_axes(n_pulse, n_range)
+    return recorded(data, data, axes, radar, values, impairments, draws, aux, clean_aux)
 
 
 @dataclass(frozen=True)
@@ -279,8 +264,7 @@ class PathError:
         turns = 2 * off[..., None] * aux["frequency_hz"] / recording.radar.wave_speed_m_s
         data = recording.signal.data
         data = range_profiles(frequency_samples(data) * unit_phasor(turns, data.dtype))
-        changed = replace(recording, signal=recording.signal.with_data(data), aux={**aux, **after.side_data()})
-        return changed, {"line_of_sight_m": off}
+        return with_samples(recording, data, **after.side_data()), {"line_of_sight_m": off}
 
 
 def _gain(world: PathWorld, antennas: AntennaPath, points: Tensor, time_s: Tensor) -> Tensor:

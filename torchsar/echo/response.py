@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Recording, per_trial
+from torchsar.echo.recorded import with_samples
 
 Curve = Callable[[Tensor], Tensor]
-# points of the true response: as many as the estimators of `torchsar.repair` return
-_POINTS = 1025
 
 
 @dataclass(frozen=True)
@@ -49,10 +48,7 @@ class ChannelResponse:
         response = torch.polar(amplitude, phase).to(data.dtype)
         impaired = torch.fft.ifft(torch.fft.fft(data) * response[..., None, :])
         phase, amplitude = self.curves(_band(data.device))
-        return replace(recording, signal=recording.signal.with_data(impaired)), {
-            "phase_rad": phase,
-            "amplitude": amplitude,
-        }
+        return with_samples(recording, impaired), {"phase_rad": phase, "amplitude": amplitude}
 
     def curves(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Return phase and amplitude of the response.
@@ -128,5 +124,5 @@ def smooth_response(
 
 
 def _band(device: torch.device) -> Tensor:
-    """Normalised frequencies -1..1 over the band, shape (_POINTS,)."""
-    return torch.linspace(-1, 1, _POINTS, dtype=torch.float64, device=device)
+    """Normalised frequencies -1..1 over the band, 1025 as in `torchsar.repair`, (1025,)."""
+    return torch.linspace(-1, 1, 1025, dtype=torch.float64, device=device)

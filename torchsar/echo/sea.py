@@ -28,7 +28,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchsar.core import Draws, fft_lines, linear_phasor, per_trial, real_dtype, unit_phasor
+from torchsar.core import Draws, fft_lines, per_trial, real_dtype, unit_phasor
+from torchsar.core.fft import smooth_length
+from torchsar.echo.sums import line_tables
 from torchsar.radar import BistaticRadar
 from torchsar.scene.bistatic import BandLimited, Pattern
 from torchsar.scene.sea import Sea
@@ -37,11 +39,8 @@ from torchsar.scene.trials import refuse_other_trials
 # largest sine of the look angle that is illuminated, by choice: towards 1 the range grows without
 # bounds
 _STEEPEST = 0.8
-_HALF_POWER = 0.443  # sinc^2(0.443) = 1/2, in units of the first null
 # cells beyond a frame whose range responses are included, by choice: a sinc has fallen to -34 dB
 _SKIRT = 16
-# phasors of a block of Doppler rows, 16 MB in complex128
-_BLOCK_PHASORS = 1 << 20
 
 
 def sea_echo(
@@ -136,9 +135,9 @@ class _Light:
         if isinstance(gate, Pattern):
             element = radar.element_m if gate.element_m is None else _of_all_trials(gate.element_m, "element_m")
             null = radar.wavelength_m / element
-            return _Light(
-                lambda sine: torch.sinc(sine / null), min(_HALF_POWER * null, _STEEPEST), min(lobes * null, _STEEPEST)
-            )
+            # sinc^2(0.443) = 1/2, in units of the first null
+            edge, last = (min(share * null, _STEEPEST) for share in (0.443, lobes))
+            return _Light(lambda sine: torch.sinc(sine / null), edge, last)
         raise TypeError(f"gate of a sea must be BandLimited(duration_s) or Pattern(), got {gate!r}")
 
 
@@ -181,7 +180,7 @@ class _Lines:
         far, cos = near + (n_range - 1) * step, math.sqrt(1 - last_sin**2)
         before = min(math.ceil(near * (1 - cos) / step) + _SKIRT, math.ceil(near / step) - 1)
         beyond = math.ceil(far * (1 / cos - 1) / step)
-        length = _fast_length(n_range + 2 * _SKIRT + max(before, beyond))
+        length = smooth_length(n_range + 2 * _SKIRT + max(before, beyond))
         return _Lines(
             -(n_range // 2) - before,
             before + n_range + _SKIRT,
@@ -257,7 +256,7 @@ class _Bins:
         highest_hz = (
             (radar.carrier_hz + radar.pulse.bandwidth_hz / 2) * light.last_sin * radar.speed_m_s / radar.wave_speed_m_s
         )
-        pulses = _fast_length(n_pulse + math.ceil(2 * margin_s * radar.prf_hz)) if margin_s else n_pulse
+        pulses = smooth_length(n_pulse + math.ceil(2 * margin_s * radar.prf_hz)) if margin_s else n_pulse
         return _Bins(max(1, math.ceil(2 * highest_hz / radar.prf_hz)), pulses, radar.prf_hz, radar.speed_m_s)
 
     @property
@@ -285,20 +284,9 @@ class _Bins:
 
     def blocks(self, lines: _Lines, device: torch.device | str | None) -> Iterator[Tensor]:
         """Blocks of rows, independent of the number of trials, so that sums round equally."""
-        height = max(1, _BLOCK_PHASORS // (2 * lines.length * (1 + math.isqrt(lines.cells))))
-        yield from torch.arange(self.n // 2 + 1, device=device).split(height)
-
-
-def _fast_length(n: int) -> int:
-    """The smallest FFT length >= n with no prime factor above 5."""
-
-    def rest(k: int) -> int:
-        for p in (2, 3, 5):
-            while k % p == 0:
-                k //= p
-        return k
-
-    return next(k for k in range(n, 2 * n + 1) if rest(k) == 1)
+        # phasors of a block, 16 MB in complex128
+        size = 2 * lines.length * (1 + math.isqrt(lines.cells))
+        yield from torch.arange(self.n // 2 + 1, device=device).split(max(1, (1 << 20) // size))
 
 
 def _sum_over_range(cells: Tensor, turns: Tensor, dtype: torch.dtype) -> Tensor:
@@ -307,9 +295,8 @@ def _sum_over_range(cells: Tensor, turns: Tensor, dtype: torch.dtype) -> Tensor:
     One trial after the other, so that sums round equally in batches of every size.
     """
     n = cells.shape[-1]
-    m = 2 ** round(math.log2(n) / 2)
-    count = -(-n // m)
-    fine, coarse = linear_phasor(turns, 0, m, dtype), linear_phasor(m * turns, -(n // 2) / m, count, dtype)
+    coarse, fine = line_tables(turns, n, -(n // 2), dtype)
+    count, m = coarse.shape[-1], fine.shape[-1]
     sums = []
     for pair in pad(cells, (0, m * count - n)).reshape(-1, *cells.shape[-3:-1], count, m):
         inner = (fine @ pair.permute(1, 3, 0, 2).flatten(-2)).unflatten(-1, (-1, count))

@@ -6,18 +6,20 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from torchsar.core import Draws, per_trial, unit_phasor
+from torchsar.echo.recorded import noise, trials_of
 from torchsar.radar import TriangularLadar
-from torchsar.scene import CalibrationFibre, SweepError
-from torchsar.scene.trials import either, finite, positive, refuse_unless, refuse_unless_finite, with_dims
+from torchsar.scene import CalibrationFibre
+from torchsar.scene.ladar import SweepError
+from torchsar.scene.trials import either, finite_numbers, with_dims
 
 
 @dataclass(frozen=True)
-class PolynomialSweepError:
+@finite_numbers("a polynomial sweep error")
+class PolynomialSweepError(SweepError):
     """Frequency error of the sweep as a polynomial, sum_i c_i u^i.
 
     u is the time from the middle of the sweep in seconds. The phase error is the antiderivative of
@@ -40,21 +42,8 @@ class PolynomialSweepError:
                 "up_hz and down_hz of a polynomial sweep error must each have at least one coefficient, "
                 f"got {self.up_hz} and {self.down_hz}; leave the sweep error out where there is none"
             )
-        for c in (*self.up_hz, *self.down_hz):
-            refuse_unless("coefficients of a polynomial sweep error must be finite", c, finite)
 
     def turns(self, time_s: Tensor, ramp: int, dims: int | None = None) -> Tensor:
-        """Return the phase error of the laser at times within a sweep.
-
-        Args:
-            time_s: Time u from the middle of the sweep in seconds, float64.
-            ramp: 0 for the up-sweep, 1 for the down-sweep.
-            dims: Number of trailing dimensions of time_s that index times; dimensions before them
-                are trials. None if all dimensions index times.
-
-        Returns:
-            Phase error in cycles, shape (*trials, *times).
-        """
         behind = time_s.ndim if dims is None else dims
         total = torch.zeros_like(time_s)
         for degree, c in reversed(list(enumerate(self.down_hz if ramp else self.up_hz))):
@@ -63,7 +52,8 @@ class PolynomialSweepError:
 
 
 @dataclass(frozen=True)
-class SinusoidSweepError:
+@finite_numbers("a sinusoidal sweep error", frequency_hz="positive")
+class SinusoidSweepError(SweepError):
     """Frequency error of the sweep as a sinusoid, A sin(2 pi F u + phase).
 
     u is the time from the middle of the sweep in seconds. The phase error is the antiderivative of
@@ -84,23 +74,7 @@ class SinusoidSweepError:
     phase_up_deg: Tensor | float = 0.0
     phase_down_deg: Tensor | float = 0.0
 
-    def __post_init__(self) -> None:
-        for name in ("amplitude_hz", "phase_up_deg", "phase_down_deg"):
-            refuse_unless_finite(f"{name} of a sinusoidal sweep error", getattr(self, name))
-        refuse_unless("frequency_hz of a sinusoidal sweep error must be above 0 Hz", self.frequency_hz, positive)
-
     def turns(self, time_s: Tensor, ramp: int, dims: int | None = None) -> Tensor:
-        """Return the phase error of the laser at times within a sweep.
-
-        Args:
-            time_s: Time u from the middle of the sweep in seconds, float64.
-            ramp: 0 for the up-sweep, 1 for the down-sweep.
-            dims: Number of trailing dimensions of time_s that index times; dimensions before them
-                are trials. None if all dimensions index times.
-
-        Returns:
-            Phase error in cycles, shape (*trials, *times).
-        """
         behind = time_s.ndim if dims is None else dims
         phase = either(self.phase_down_deg if ramp else self.phase_up_deg, math.radians, torch.deg2rad)
         amplitude, frequency, middle, phase = (
@@ -177,10 +151,8 @@ def calibration_channel(
         rows.append(turns if error is None else turns + error.turns(u, ramp, 1) - error.turns(u - delay, ramp, 1))
     clean = unit_phasor(torch.stack(torch.broadcast_tensors(*rows), -2), dtype)[..., None, :]
     shape = (2, n_period if fibre.every_period else 1, len(u))
-    if fibre.snr_db is None:
-        trials = np.broadcast_shapes(clean.shape[:-3], () if draws.trials is None else (len(draws.trials),))
-        found = clean.expand(*trials, *shape)
-    else:
-        std = 10 ** (-per_trial(fibre.snr_db, 3, u) / 20)
-        found = clean + draws.normal("echo.calibration.noise", shape, dtype, device) * std.to(clean.real.dtype)
+    found = clean.expand(*trials_of(draws, 3, clean), *shape)
+    if fibre.snr_db is not None:
+        std = 10 ** (-per_trial(fibre.snr_db, 0, u) / 20)
+        found = clean + noise(draws, "echo.calibration.noise", shape, std, dtype, device)
     return found.conj().resolve_conj() if radar.dechirp_sign == "echo_conj_lo" else found

@@ -22,6 +22,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchsar.core import checked_samples, host_largest, real_dtype
+from torchsar.core.fft import smooth_length as smooth_length
 
 
 @dataclass(frozen=True)
@@ -401,22 +402,3 @@ def nufft_type1(y: Tensor, points: Tensor, n: int, eps: float = 1e-6) -> Tensor:
     y = checked_samples(y, "nufft_type1", "point", finite=False)
     plan = Nufft(n, eps, y.dtype, y.device)
     return plan.type1(y, plan.points(points))
-
-
-def smooth_length(n: int) -> int:
-    """Return the least FFT length of at least n without prime factors above 5.
-
-    Args:
-        n: Least length.
-
-    Returns:
-        Length, at most 2 n.
-
-    Raises:
-        ValueError: If n is below 1.
-    """
-    if n < 1:
-        raise ValueError(f"an FFT has at least one sample, got the length {n}")
-
-    # k has no prime factor above 5 if it divides a power of 30 that is high enough
-    return next(k for k in range(n, 2 * n + 1) if pow(30, k.bit_length(), k) == 0)

@@ -14,11 +14,11 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws
-from torchsar.scene.targets import Scatterers
-from torchsar.scene.trials import either, positive, refuse_unless, refuse_unless_finite, stacked, with_dims
+from torchsar.scene.targets import Scatterers, Scene, unit_phases
+from torchsar.scene.trials import either, finite_numbers, refuse_unless, stacked, with_dims
 
-# one half of the outline from nose to tail, along the fuselage in lengths and across it in half
-# spans; chosen here, as the publication gives no coordinates
+# one half of the outline from nose to tail, and the fin from above, along the fuselage in lengths
+# and across it in half spans; chosen here, as the publication gives no coordinates
 _SIDE = (
     (0.50, 0.000),
     (0.47, 0.060),
@@ -33,13 +33,7 @@ _SIDE = (
     (-0.46, 0.060),
     (-0.49, 0.000),
 )
-# fin from above, in the same units; chosen here
 _FIN = ((-0.36, 0.0), (-0.48, 0.0))
-
-
-def _mirrored(line: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
-    """The line on the other side of the fuselage."""
-    return tuple((x, -y) for x, y in line)
 
 
 def along_line(corners: Tensor, spacing_m: float) -> Tensor:
@@ -61,7 +55,8 @@ def along_line(corners: Tensor, spacing_m: float) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Aircraft:
+@finite_numbers("an aircraft", spacing_m="positive", length_m="positive", width_m="positive")
+class Aircraft(Scene):
     """Outline of an aircraft with swept wings, tail plane and fin, about 600 scatterers.
 
     The fuselage lies along cross range; ranges count from the middle of the window. The publication
@@ -90,14 +85,6 @@ class Aircraft:
     width_m: float = 0.15
     heading_deg: Tensor | float = 0.0
 
-    def __post_init__(self) -> None:
-        for name in ("spacing_m", "length_m", "width_m"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise ValueError(
-                    f"{name} of an aircraft must be a positive number of metres, got {getattr(self, name)}"
-                )
-        refuse_unless_finite("heading_deg of an aircraft", self.heading_deg)
-
     def outline(self) -> Tensor:
         """Return the scatterers before their random displacement.
 
@@ -105,33 +92,24 @@ class Aircraft:
             Cross range and range in metres, shape (..., target, 2), float64.
         """
         scale = torch.tensor([self.length_m, self.width_m / 2], dtype=torch.float64)
-        lines = (_SIDE, _mirrored(_SIDE), _FIN)
-        points = torch.cat(
-            [along_line(scale * torch.tensor(line, dtype=torch.float64), self.spacing_m) for line in lines]
-        )
+        side, fin = (torch.tensor(line, dtype=torch.float64) for line in (_SIDE, _FIN))
+        lines = (side, side * torch.tensor([1.0, -1.0], dtype=torch.float64), fin)
+        points = torch.cat([along_line(scale * line, self.spacing_m) for line in lines])
         turn = either(self.heading_deg, math.radians, torch.deg2rad)
         cos, sin = either(turn, math.cos, torch.cos), either(turn, math.sin, torch.sin)
         return points @ stacked([cos, sin, -sin, cos]).unflatten(-1, (2, 2))
 
     def scatterers(self, draws: Draws) -> Scatterers:
-        """Draw displaced scatterers with circular Gaussian amplitudes.
-
-        Args:
-            draws: Source of random numbers.
-
-        Returns:
-            Scatterers of shape (..., target).
-        """
         points = self.outline()
         shape = tuple(points.shape[-2:])
         moved = points + self.spacing_m * (draws.uniform("scene.aircraft.place", shape) - 0.5)
-        return Scatterers(
-            moved[..., 0], moved[..., 1], draws.normal("scene.aircraft.amplitude", shape[:1], torch.complex128)
-        )
+        amplitude = draws.normal("scene.aircraft.amplitude", shape[:1], torch.complex128)
+        return Scatterers(moved[..., 0], moved[..., 1], amplitude)
 
 
 @dataclass(frozen=True)
-class SpreadRows:
+@finite_numbers("spread rows", width=None, extent_m="positive", range_step_m="positive")
+class SpreadRows(Scene):
     """Occupied range cells with several scatterers of unit amplitude in each.
 
     The occupied cells are spread evenly over the window and lie on its grid, where sample
@@ -163,24 +141,13 @@ class SpreadRows:
                 f"a row, must be at least 1, got rows={self.rows}, per_row={self.per_row}"
             )
         refuse_unless("width of spread rows must be in 0..1", self.width, lambda x: (x >= 0) & (x <= 1))
-        for name in ("extent_m", "range_step_m"):
-            refuse_unless(f"{name} of spread rows must be a positive number of metres", getattr(self, name), positive)
 
     def scatterers(self, draws: Draws) -> Scatterers:
-        """Draw phases and cross ranges.
-
-        Args:
-            draws: Source of random numbers.
-
-        Returns:
-            Scatterers of shape (..., rows * per_row).
-        """
         cell = (
             (torch.arange(self.rows, dtype=torch.float64) + 0.5) * self.range_cells / self.rows
         ).floor() - self.range_cells // 2
         shape = (self.rows, self.per_row)
         width, extent, step = (with_dims(v, 2, cell) for v in (self.width, self.extent_m, self.range_step_m))
         x = width * extent * (draws.uniform("scene.rows.azimuth", shape) - 0.5)
-        turns = draws.uniform("scene.rows.phase", shape)
-        amplitude = torch.polar(torch.ones_like(turns), 2 * math.pi * turns)
+        amplitude = unit_phases(draws.uniform("scene.rows.phase", shape))
         return Scatterers(*(v.flatten(-2) for v in torch.broadcast_tensors(x, cell[:, None] * step, amplitude)))

@@ -14,9 +14,9 @@ from torch import Tensor
 from torchsar.radar import BistaticRadar, Orbit
 from torchsar.radar.bistatic import polynomial_range
 from torchsar.radar.orbit import orbit_range
-from torchsar.scene.moving import ExactRange, Movers, MovingScene, ReceiveRange
+from torchsar.scene.movers import Movers, MovingScene
 from torchsar.scene.sea import Sea
-from torchsar.scene.trials import positive, refuse_unless, refuse_unless_finite, stacked, with_dims
+from torchsar.scene.trials import finite_numbers, stacked, with_dims
 
 
 class Gate(Protocol):
@@ -37,7 +37,8 @@ class Gate(Protocol):
 
 
 @dataclass(frozen=True)
-class BandLimited:
+@finite_numbers("a band-limited gate", duration_s="positive")
+class BandLimited(Gate):
     """Gate that passes each target for a limited time, equal in all channels.
 
     The interval is centred on the time y0 / v of the closest approach along track, so that the
@@ -54,30 +55,15 @@ class BandLimited:
 
     duration_s: Tensor | float
 
-    def __post_init__(self) -> None:
-        refuse_unless("duration_s of a band-limited gate must be a positive number", self.duration_s, positive)
-
     def weight(self, movers: Movers, time_s: Tensor, radar: BistaticRadar) -> Tensor:
-        """Return the gain, one where |t - y0 / v| < duration_s / 2 and zero elsewhere.
-
-        t is the slow time, y0 the along-track position of the target at t = 0, and v the
-        along-track speed of the receiver relative to the target.
-
-        Args:
-            movers: Targets.
-            time_s: Slow time in seconds, shape (pulse,), float64.
-            radar: Radar parameters.
-
-        Returns:
-            Shape (..., 1, pulse, target), float64.
-        """
         abreast = movers.y0_m.detach() / (radar.speed_m_s - movers.u_a_m_s.detach())
         duration = with_dims(self.duration_s, 3, time_s)
         return ((time_s[:, None] - abreast[..., None, None, :]).abs() < duration / 2).to(torch.float64)
 
 
 @dataclass(frozen=True)
-class Pattern:
+@finite_numbers("a pattern", element_m="positive")
+class Pattern(Gate):
     """One-way pattern of a uniformly illuminated antenna element over the whole record.
 
     The amplitude gain is sin(pi q) / (pi q) with q = element_m sin(look) / wavelength and
@@ -95,13 +81,18 @@ class Pattern:
 
     element_m: Tensor | float | None = None
 
-    def __post_init__(self) -> None:
-        if self.element_m is not None:
-            sentence = "element_m of a pattern must be a positive length, or None for that of the radar"
-            refuse_unless(sentence, self.element_m, positive)
-
     def weight(self, movers: Movers, time_s: Tensor, radar: BistaticRadar) -> Tensor:
-        """Return the amplitude gain of the receive pattern.
+        closest = movers.closest_m(radar)[..., None, None, :]
+        sine = movers.along_m(time_s, radar) / (closest + movers.excess_m(time_s, radar))
+        element = radar.element_m if self.element_m is None else with_dims(self.element_m, 3, time_s)
+        return torch.sinc(element / radar.wavelength_m * sine)
+
+
+class ReceiveRange(Protocol):
+    """Model of the range from targets to the receiver."""
+
+    def range_m(self, movers: Movers, time_s: Tensor, radar: BistaticRadar) -> Tensor:
+        """Return the range relative to the reference range.
 
         Args:
             movers: Targets.
@@ -109,12 +100,78 @@ class Pattern:
             radar: Radar parameters.
 
         Returns:
-            Shape (..., channel, pulse, target), float64.
+            Range in metres, shape (..., channel, pulse, target), float64.
         """
+        ...
+
+    def neglected_phase_rad(self, movers: Movers, time_s: Tensor, radar: BistaticRadar) -> Tensor:
+        """Return the largest phase that the model neglects.
+
+        Args:
+            movers: Targets.
+            time_s: Slow time in seconds, shape (pulse,), float64.
+            radar: Radar parameters.
+
+        Returns:
+            Phase in radians, shape (...,).
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class ExactRange(ReceiveRange):
+    """Exact range by the square root: the default, as fast as any series."""
+
+    def range_m(self, movers: Movers, time_s: Tensor, radar: BistaticRadar) -> Tensor:
+        return movers.range_m[..., None, None, :] + movers.excess_m(time_s, radar)
+
+    def neglected_phase_rad(self, movers: Movers, time_s: Tensor, radar: BistaticRadar) -> Tensor:
+        return torch.zeros(movers.range_m.shape[:-1], dtype=torch.float64, device=time_s.device)
+
+
+@dataclass(frozen=True)
+class TaylorRange(ReceiveRange):
+    """Power series of the range to the receiver about the closest range.
+
+    For the range R_m to channel m and the closest range R0 the series is
+    R_m - R0 = R0 (x / 2 - x^2 / 8 + ...) with x = R_m^2 / R0^2 - 1. The same series holds for the
+    whole range history, and it converges for R_m < 1.4 R0. Order 2 is the parabola of the
+    publication, with u_r^2 instead of the misprinted u_a^2 in the last numerator of Eq. (3).
+
+    Args:
+        order: Twice the highest power of x that is kept: 2, 4, 6, ...
+
+    Raises:
+        ValueError: If the order is odd or below 2.
+
+    Reference:
+        Remote Sens. 2020, 12, 1703, Eqs. (3), (5).
+    """
+
+    order: int = 2
+
+    def __post_init__(self) -> None:
+        if self.order < 2 or self.order % 2:
+            raise ValueError(
+                f"order of a range series must be 2, 4, 6, ..., got {self.order}; give twice the number of terms"
+            )
+
+    def range_m(self, movers: Movers, time_s: Tensor, radar: BistaticRadar) -> Tensor:
         closest = movers.closest_m(radar)[..., None, None, :]
-        sine = movers.along_m(time_s, radar) / (closest + movers.excess_m(time_s, radar))
-        element = radar.element_m if self.element_m is None else with_dims(self.element_m, 3, time_s)
-        return torch.sinc(element / radar.wavelength_m * sine)
+        excess = movers.excess_m(time_s, radar) / closest
+        x = excess * (excess + 2)
+        # coefficients of x, x^2, ... in sqrt(1 + x)
+        factors = [1.0]
+        for n in range(self.order // 2):
+            factors.append(factors[-1] * ((0.5 - n) / (n + 1)))
+        total = torch.zeros_like(x)
+        for factor in reversed(factors[1:]):
+            total = (total + factor) * x
+        return movers.range_m[..., None, None, :] + closest * total
+
+    def neglected_phase_rad(self, movers: Movers, time_s: Tensor, radar: BistaticRadar) -> Tensor:
+        missed = ExactRange().range_m(movers, time_s, radar) - self.range_m(movers, time_s, radar)
+        return 2 * math.pi / radar.wavelength_m * missed.abs().amax((-3, -2, -1))
 
 
 class TransmitRange(Protocol):
@@ -133,7 +190,8 @@ class TransmitRange(Protocol):
 
 
 @dataclass(frozen=True)
-class PolynomialTransmit:
+@finite_numbers("a transmit range")
+class PolynomialTransmit(TransmitRange):
     """Polynomial range from the transmitter, R_T(t) - R_T(0) = k1 t + k2 t^2 + ...
 
     Args:
@@ -148,8 +206,6 @@ class PolynomialTransmit:
     order: int | None = None
 
     def __post_init__(self) -> None:
-        for degree, value in enumerate(self.coefficients, start=1):
-            refuse_unless_finite(f"coefficient {degree} of a transmit range", value)
         if self.order is not None and not 0 <= self.order <= len(self.coefficients):
             raise ValueError(
                 f"order, the number of coefficients of the transmit range that are used, must lie in "
@@ -157,14 +213,6 @@ class PolynomialTransmit:
             )
 
     def range_m(self, time_s: Tensor) -> Tensor:
-        """Return the change of the range to the transmitter since slow time zero.
-
-        Args:
-            time_s: Slow time in seconds, any shape, float64.
-
-        Returns:
-            Change R_T(t) - R_T(0) of the range R_T in metres, shape (*trials, *times), float64.
-        """
         kept = [with_dims(k, time_s.ndim, time_s) for k in self.coefficients[: self.order]]
         return polynomial_range(kept, time_s)
 
@@ -186,7 +234,8 @@ class PolynomialTransmit:
 
 
 @dataclass(frozen=True)
-class OrbitTransmit:
+@finite_numbers("a transmit range")
+class OrbitTransmit(TransmitRange):
     """Exact range from a satellite to a point of the scene that rotates with the Earth.
 
     Args:
@@ -208,22 +257,13 @@ class OrbitTransmit:
             raise ValueError(
                 f"point_m must be three coordinates (m) in the inertial frame, got {len(self.point_m)} of them"
             )
-        refuse_unless_finite("point_m of a transmit range", self.point_m)
-        refuse_unless_finite("epoch_s of a transmit range", self.epoch_s)
 
     def range_m(self, time_s: Tensor) -> Tensor:
-        """Return the change of the range to the transmitter since slow time zero.
-
-        Args:
-            time_s: Slow time in seconds, shape (pulse,), float64.
-
-        Returns:
-            Change R_T(t) - R_T(0) of the range R_T in metres, shape (..., pulse), float64.
-        """
         return orbit_range(self.orbit, stacked(self.point_m, time_s.device), self.epoch_s, time_s)
 
 
 @dataclass(frozen=True)
+@finite_numbers()
 class BistaticWorld:
     """Moving targets, their receive gain, the sea beneath them and the noise.
 
@@ -261,4 +301,3 @@ class BistaticWorld:
             raise TypeError(f"receive must be ExactRange() or TaylorRange(order), got {self.receive!r}")
         if self.scene is None and self.sea is None:
             raise ValueError("a world without moving targets and without a sea is empty; give it a scene or a sea")
-        refuse_unless_finite("snr_db", self.snr_db)

@@ -20,18 +20,11 @@ from torch import Tensor
 from torchsar.core import Draws, Spline, per_trial
 from torchsar.radar.navigation import resample_path
 from torchsar.scene.fluctuation import MeasuredTrack, RandomMotion, drawn_motion
-from torchsar.scene.trials import refuse_other_trials, refuse_unless, refuse_unless_finite
+from torchsar.scene.trials import finite_numbers, refuse_other_trials, refuse_unless
 from torchsar.scene.vibration import Motion, displacement_m
 
-# time before the first and after the last pulse for which motions are drawn, in s, by choice:
-# what navigation records late, and between pulses, lies within
-_LEAD_S = 1.0
-# largest latency, and longest interval of records, in s; both fit into the time above
+# longest latency and interval of records of a navigation in s, by choice
 _LONGEST_S = 0.5
-# least number of records from which positions are interpolated
-_RECORDS = 5
-# relative error of the product of a time and a rate, below which it is a whole number
-_ROUNDING = 1e-9
 
 
 class NominalPath(Protocol):
@@ -50,7 +43,8 @@ class NominalPath(Protocol):
 
 
 @dataclass(frozen=True)
-class StraightPath:
+@finite_numbers("a straight path")
+class StraightPath(NominalPath):
     """Straight path of constant speed; a speed of zero is a fixed antenna.
 
     Args:
@@ -65,24 +59,20 @@ class StraightPath:
     velocity_m_s: Sequence[float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        _refuse_unless_three("start_m of a straight path", self.start_m)
-        _refuse_unless_three("velocity_m_s of a straight path", self.velocity_m_s)
+        if not len(self.start_m) == len(self.velocity_m_s) == 3:
+            raise ValueError(
+                f"start_m and velocity_m_s of a straight path must be three numbers x, y, z, got {list(self.start_m)} "
+                f"and {list(self.velocity_m_s)}"
+            )
 
     def position_m(self, time_s: Tensor) -> Tensor:
-        """Return the position.
-
-        Args:
-            time_s: Times since the first pulse in seconds, shape (pulse,), float64.
-
-        Returns:
-            Position in metres, shape (pulse, 3), float64.
-        """
         start, velocity = (time_s.new_tensor(list(v)) for v in (self.start_m, self.velocity_m_s))
         return start + time_s[:, None] * velocity
 
 
 @dataclass(frozen=True)
-class CircularPath:
+@finite_numbers("a circular path", radius_m=0.0)
+class CircularPath(NominalPath):
     """Horizontal circle about the vertical axis through the origin, at constant speed.
 
     The azimuth is counted from axis x towards y.
@@ -102,26 +92,15 @@ class CircularPath:
     start_rad: float
     rate_rad_s: float
 
-    def __post_init__(self) -> None:
-        refuse_unless_finite("radius_m of a circular path", self.radius_m, 0.0)
-        refuse_unless_finite("the numbers of a circular path", (self.height_m, self.start_rad, self.rate_rad_s))
-
     def position_m(self, time_s: Tensor) -> Tensor:
-        """Return the position.
-
-        Args:
-            time_s: Times since the first pulse in seconds, shape (pulse,), float64.
-
-        Returns:
-            Position in metres, shape (pulse, 3), float64.
-        """
         angle = self.start_rad + self.rate_rad_s * time_s
         x, y = self.radius_m * torch.cos(angle), self.radius_m * torch.sin(angle)
         return torch.stack([x, y, torch.full_like(x, self.height_m)], -1)
 
 
 @dataclass(frozen=True)
-class Offset:
+@finite_numbers("an offset")
+class Offset(Motion):
     """Constant displacement.
 
     Args:
@@ -133,23 +112,13 @@ class Offset:
 
     metres: Tensor | float
 
-    def __post_init__(self) -> None:
-        refuse_unless_finite("metres of an offset", self.metres)
-
     def displacement_m(self, time_s: Tensor) -> Tensor:
-        """Return the displacement.
-
-        Args:
-            time_s: Times in seconds, any shape, float64.
-
-        Returns:
-            Displacement in metres, shape (*trials, *times).
-        """
         return per_trial(self.metres, time_s.ndim, time_s) + torch.zeros_like(time_s)
 
 
 @dataclass(frozen=True)
-class Jitter:
+@finite_numbers("jitter", rms_m=0.0, step_s="positive")
+class Jitter(RandomMotion):
     """Independent normally distributed displacements at equal steps, with a spline between them.
 
     With the pulse interval as step, every pulse has its own displacement.
@@ -165,27 +134,15 @@ class Jitter:
     rms_m: Tensor | float
     step_s: float
 
-    def __post_init__(self) -> None:
-        refuse_unless_finite("rms_m of jitter", self.rms_m, 0.0)
-        _refuse_unless_positive("step_s of jitter", self.step_s)
-
     def drawn(self, draws: Draws, span_s: float) -> MeasuredTrack:
-        """Draw the displacements.
-
-        Args:
-            draws: Source of random numbers.
-            span_s: Length of the recording in seconds.
-
-        Returns:
-            The displacement in each trial.
-        """
         time_s = _steps(span_s, self.step_s)
         unit = draws.normal("scene.flight.jitter", (len(time_s),))
         return MeasuredTrack(time_s, per_trial(self.rms_m, 1, unit) * unit)
 
 
 @dataclass(frozen=True)
-class RandomWalk:
+@finite_numbers("a random walk", m_per_root_s=0.0, step_s="positive")
+class RandomWalk(RandomMotion):
     """Sum of independent normally distributed steps, zero at the first pulse.
 
     Its standard deviation at the time t is `m_per_root_s` sqrt(t). About the mean of a recording of
@@ -203,20 +160,7 @@ class RandomWalk:
     m_per_root_s: Tensor | float
     step_s: float
 
-    def __post_init__(self) -> None:
-        refuse_unless_finite("m_per_root_s of a random walk", self.m_per_root_s, 0.0)
-        _refuse_unless_positive("step_s of a random walk", self.step_s)
-
     def drawn(self, draws: Draws, span_s: float) -> MeasuredTrack:
-        """Draw the steps.
-
-        Args:
-            draws: Source of random numbers.
-            span_s: Length of the recording in seconds.
-
-        Returns:
-            The displacement in each trial.
-        """
         time_s = _steps(span_s, self.step_s)
         unit = draws.normal("scene.flight.walk", (len(time_s),)).cumsum(-1) * math.sqrt(self.step_s)
         unit = unit - unit[..., int(time_s.abs().argmin()), None]
@@ -316,6 +260,7 @@ class Flight:
 
 
 @dataclass(frozen=True)
+@finite_numbers("a navigation", latency_s=None, step_m=0.0, rate_hz=1 / _LONGEST_S)
 class Navigation:
     """What navigation records of a flight: late positions with errors, in whole steps.
 
@@ -338,12 +283,11 @@ class Navigation:
     rate_hz: float | None = None
 
     def __post_init__(self) -> None:
-        within = (
-            f"latency_s of a navigation must be a number of at most {_LONGEST_S:g} s in magnitude, or one per trial"
+        refuse_unless(
+            f"latency_s of a navigation must be a number of at most {_LONGEST_S:g} s in magnitude, or one per trial",
+            self.latency_s,
+            lambda x: abs(x) <= _LONGEST_S,
         )
-        refuse_unless(within, self.latency_s, lambda x: abs(x) <= _LONGEST_S)
-        refuse_unless_finite("step_m of a navigation", self.step_m, 0.0)
-        refuse_unless_finite("rate_hz of a navigation", self.rate_hz, 1 / _LONGEST_S)
 
     def recorded_m(self, draws: Draws, time_s: Tensor, path: NominalPath) -> Tensor:
         """Return the positions that are known at the pulses.
@@ -367,10 +311,10 @@ class Navigation:
         error = self.error.drawn(draws.part("navigation"), span_s)
         if self.rate_hz is None:
             return self._records_m(error, time_s, path)
-        n = math.ceil(span_s * self.rate_hz - _ROUNDING) + 1
-        if n < _RECORDS:
+        n = math.ceil(span_s * self.rate_hz - 1e-9) + 1
+        if n < 5:
             raise ValueError(
-                f"navigation needs at least {_RECORDS} records, got {n} at rate_hz={self.rate_hz:g} in {span_s:g} s"
+                f"navigation needs at least 5 records, got {n} at rate_hz={self.rate_hz:g} in {span_s:g} s"
             )
         at = time_s[0] + torch.arange(n, dtype=torch.float64, device=time_s.device) / self.rate_hz
         return resample_path(at, self._records_m(error, at, path), time_s, jump_m=math.inf)
@@ -397,18 +341,8 @@ class Navigation:
 
 
 def _steps(span_s: float, step_s: float) -> Tensor:
-    """Times in equal steps that cover a recording and some time around it; one of them is zero."""
-    before, after = (math.ceil(time_s / step_s - _ROUNDING) for time_s in (_LEAD_S, span_s + _LEAD_S))
+    """Times in equal steps from a second before the first pulse to one after the last, zero among
+    them: what navigation records late, and between pulses, lies within.
+    """
+    before, after = (math.ceil(time_s / step_s - 1e-9) for time_s in (1.0, span_s + 1.0))
     return step_s * torch.arange(-before, after + 1, dtype=torch.float64)
-
-
-def _refuse_unless_three(what: str, value: Sequence[float]) -> None:
-    """Raise ValueError unless there are three finite numbers."""
-    if len(value) != 3 or not all(math.isfinite(v) for v in value):
-        raise ValueError(f"{what} must be three finite numbers x, y, z, got {list(value)}")
-
-
-def _refuse_unless_positive(what: str, value: float) -> None:
-    """Raise ValueError unless a number is positive and finite."""
-    if not 0 < value < math.inf:
-        raise ValueError(f"{what} must be a positive number, got {value}")

@@ -4,24 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, fields
 from typing import Protocol, runtime_checkable
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import ArrayFile, Draws, Spline
-from torchsar.scene.trials import finite, positive, refuse_unless, refuse_unless_finite, with_dims
+from torchsar.core import Draws, Spline
+from torchsar.scene.trials import finite, finite_numbers, positive, refuse_unless, refuse_unless_finite, with_dims
 from torchsar.scene.vibration import Motion
-
-# times in a block: the phases of 64 tones then take 8 MB, about the cache of a processor
-_TIMES_AT_ONCE = 1 << 14
-# default upper end of a band, by choice
-_HIGHEST_HZ = 2000.0
-# largest departure from equal spacing of a measured track, in steps, by choice
-_UNEVEN = 1e-3
 
 
 @runtime_checkable
@@ -60,7 +51,7 @@ def drawn_motion(motion: Sequence[Motion | RandomMotion], draws: Draws, span_s: 
 
 
 @dataclass(frozen=True)
-class Tones:
+class Tones(Motion):
     """Sum of sinusoids, sum_i cosine_i cos(2 pi f_i t) + sine_i sin(2 pi f_i t).
 
     Args:
@@ -83,34 +74,75 @@ class Tones:
         Returns:
             Sum in the unit of the amplitudes, shape (*trials, *times), float64.
         """
-        times = max(1, _TIMES_AT_ONCE // self.frequency_hz.shape[:-1].numel())
+        # the phases of 64 tones then take 8 MB, about the cache of a processor
+        times = max(1, (1 << 14) // self.frequency_hz.shape[:-1].numel())
         parts = [self._block(block) for block in time_s.flatten().split(times)]
         values = torch.cat(parts, -1)
         return values.reshape((*values.shape[:-1], *time_s.shape))
 
-    def displacement_m(self, time_s: Tensor) -> Tensor:
-        """Return the sum as a displacement; see `Motion`.
-
-        Args:
-            time_s: Times in seconds, any shape, float64.
-
-        Returns:
-            Displacement in metres, shape (*trials, *times).
-        """
-        return self.value(time_s)
+    displacement_m = value
 
     def _block(self, time_s: Tensor) -> Tensor:
         """The sum at times (time,), (*trials, time)."""
         turns = self.frequency_hz.to(time_s.device)[..., None] * time_s
         angle = 2 * math.pi * (turns - torch.round(turns.detach()))
         cosine, sine = self.cosine.to(time_s.device), self.sine.to(time_s.device)
-        if angle.ndim == 2:
+        if angle.ndim == 2:  # frequencies that all trials share
             return cosine @ torch.cos(angle) + sine @ torch.sin(angle)
         return (cosine[..., None, :] @ torch.cos(angle) + sine[..., None, :] @ torch.sin(angle))[..., 0, :]
 
 
 @dataclass(frozen=True)
-class VibrationSpectrum:
+class _PowerLaw:
+    """Base of random functions of time whose spectral density follows a power of the frequency."""
+
+    def __post_init__(self) -> None:
+        expected = "a random motion needs 0 < lowest_hz <= highest_hz and a finite slope"
+        low, high, slope, count = self._band
+        refuse_unless(expected, slope, finite)
+        for bound in (low, high):
+            if bound is not None:
+                refuse_unless(expected, bound, positive)
+        if low is not None and high is not None:
+            refuse_unless(expected, low, lambda x: x <= high, f"highest_hz is {high}")
+        if not (isinstance(count, int) and count >= 1):
+            raise ValueError(f"count of sinusoids of a random motion must be a whole number of 1 or more, got {count}")
+
+    @property
+    def _band(self) -> tuple[Tensor | float | None, Tensor | float | None, Tensor | float, int]:
+        """Limits of the band, exponent, and number of sinusoids."""
+        return tuple(getattr(self, name) for name in ("lowest_hz", "highest_hz", "slope", "count"))  # pyright: ignore
+
+    @property
+    def _rms(self) -> Tensor | float:
+        """Root mean square, the first parameter of the class."""
+        return getattr(self, fields(self)[0].name)
+
+    def drawn(self, draws: Draws, span_s: float) -> Tones:
+        """Draw the phases of the sinusoids.
+
+        Args:
+            draws: Source of random numbers.
+            span_s: Length of the recording in seconds.
+
+        Returns:
+            The sinusoids, amplitudes in the unit of the rms value.
+
+        Raises:
+            ValueError: If the band is empty, because its upper end is below one cycle in the
+                recording.
+        """
+        lowest, highest, slope, count = self._band
+        lowest = 1 / span_s if lowest is None else lowest
+        if highest is None:
+            default = torch.as_tensor(10 * lowest, dtype=torch.float64).clamp_min(2000.0)
+            highest = default if isinstance(lowest, Tensor) else float(default)
+        return random_tones(draws, self._rms, lowest, highest, slope, count)
+
+
+@dataclass(frozen=True)
+@finite_numbers("a random motion", rms_m=0.0, lowest_hz=None, highest_hz=None, slope=None)
+class VibrationSpectrum(_PowerLaw):
     """Random vibration whose power spectral density follows a power of the frequency.
 
     The motion is a sum of sinusoids with random phases. Their frequencies are spaced evenly in the
@@ -134,26 +166,6 @@ class VibrationSpectrum:
     slope: Tensor | float = 0.0
     count: int = 64
 
-    def __post_init__(self) -> None:
-        refuse_unless_finite("rms_m of a random motion", self.rms_m, 0.0)
-        _refuse_band(self.lowest_hz, self.highest_hz, self.slope, self.count)
-
-    def drawn(self, draws: Draws, span_s: float) -> Tones:
-        """Draw the phases of the sinusoids.
-
-        Args:
-            draws: Source of random numbers.
-            span_s: Length of the recording in seconds.
-
-        Returns:
-            The sinusoids, amplitudes in metres.
-
-        Raises:
-            ValueError: If the band is empty, because its upper end is below one cycle in the
-                recording.
-        """
-        return random_tones(draws, self.rms_m, *_band(self.lowest_hz, self.highest_hz, span_s), self.slope, self.count)
-
 
 @dataclass(frozen=True)
 class PathFluctuation(VibrationSpectrum):
@@ -175,15 +187,14 @@ class PathFluctuation(VibrationSpectrum):
         ValueError: If the rms value is negative, the band is empty or the count is not positive.
     """
 
-    rms_m: Tensor | float
     lowest_hz: Tensor | float | None = None
     highest_hz: Tensor | float | None = None
     slope: Tensor | float = -8 / 3
-    count: int = 64
 
 
 @dataclass(frozen=True)
-class LogAmplitude:
+@finite_numbers("a log-amplitude", rms=0.0, lowest_hz=None, highest_hz=None, slope=None)
+class LogAmplitude(_PowerLaw):
     """Scintillation: the echo amplitude is multiplied by exp(chi(t)), equally for all scatterers.
 
     By default the power spectral density of the log-amplitude chi follows f^(-5/3).
@@ -205,38 +216,6 @@ class LogAmplitude:
     highest_hz: Tensor | float | None = None
     slope: Tensor | float = -5 / 3
     count: int = 64
-
-    def __post_init__(self) -> None:
-        refuse_unless_finite("rms of a log-amplitude", self.rms, 0.0)
-        _refuse_band(self.lowest_hz, self.highest_hz, self.slope, self.count)
-
-    def drawn(self, draws: Draws, span_s: float) -> Tones:
-        """Draw the phases of the sinusoids.
-
-        Args:
-            draws: Source of random numbers.
-            span_s: Length of the recording in seconds.
-
-        Returns:
-            chi as a sum of sinusoids.
-
-        Raises:
-            ValueError: If the band is empty, because its upper end is below one cycle in the
-                recording.
-        """
-        return random_tones(draws, self.rms, *_band(self.lowest_hz, self.highest_hz, span_s), self.slope, self.count)
-
-
-def _band(
-    lowest_hz: Tensor | float | None, highest_hz: Tensor | float | None, span_s: float
-) -> tuple[Tensor | float, Tensor | float]:
-    """Limits of the band with their defaults."""
-    lowest = 1 / span_s if lowest_hz is None else lowest_hz
-    if highest_hz is not None:
-        return lowest, highest_hz
-    if isinstance(lowest, Tensor):
-        return lowest, (10 * lowest.to(torch.float64)).clamp_min(_HIGHEST_HZ)
-    return lowest, max(_HIGHEST_HZ, 10 * lowest)
 
 
 def random_tones(
@@ -263,7 +242,12 @@ def random_tones(
     Raises:
         ValueError: If the band is empty.
     """
-    _refuse_empty_band(lowest_hz, highest_hz)
+    refuse_unless(
+        "highest_hz of a random motion must not be below lowest_hz, which is by default one cycle in the recording",
+        highest_hz,
+        lambda x: x >= lowest_hz,
+        "give lowest_hz or a larger highest_hz",
+    )
     angle = 2 * math.pi * draws.uniform("scene.tones.phase", (count,))
     lowest_hz, highest_hz, slope = (with_dims(v, 1, angle) for v in (lowest_hz, highest_hz, slope))
     edges = lowest_hz * (highest_hz / lowest_hz) ** (torch.arange(count + 1, dtype=torch.float64) / count)
@@ -276,7 +260,7 @@ def random_tones(
 
 
 @dataclass(frozen=True)
-class MeasuredTrack:
+class MeasuredTrack(Motion):
     """Measured displacement at equally spaced times, interpolated by a cubic spline.
 
     Args:
@@ -305,7 +289,7 @@ class MeasuredTrack:
         refuse_unless_finite("displacement of a measured track", track)
         step = self.step_s
         off = float((time - time[0] - step * torch.arange(len(time), dtype=torch.float64)).abs().max())
-        if not (step > 0 and off <= _UNEVEN * step):
+        if not (step > 0 and off <= 1e-3 * step):
             raise ValueError(
                 f"times of a measured track must rise evenly, got a mean step of {step:g} s and times up to "
                 f"{off:.3g} s away from even spacing; resample the track first"
@@ -316,46 +300,7 @@ class MeasuredTrack:
         """Return the time step in seconds."""
         return float(self.time_s[-1] - self.time_s[0]) / (len(self.time_s) - 1)
 
-    @classmethod
-    def from_file(cls, file: str | Path) -> MeasuredTrack:
-        """Read a track of times in seconds and displacements in metres.
-
-        Args:
-            file: Text or .csv file of two columns (separated by commas or blanks, a line of names
-                is allowed), .npy file of shape (n, 2), or .npz file with `time_s` (n,) and
-                `displacement_m` (..., n).
-
-        Returns:
-            The track.
-
-        Raises:
-            ValueError: If the file does not exist or holds anything else; the message names the
-                file.
-        """
-        path = Path(file)
-        if not path.is_file():
-            raise ValueError(
-                f"{path}: no such file; a measured track is a text, .csv, .npy or .npz file of times "
-                "(s) and displacements (m)"
-            )
-        time, track = _columns_of(path)
-        try:
-            return cls(torch.as_tensor(time, dtype=torch.float64), torch.as_tensor(track, dtype=torch.float64))
-        except (TypeError, ValueError) as problem:
-            raise ValueError(f"{path}: {problem}") from None
-
     def displacement_m(self, time_s: Tensor) -> Tensor:
-        """Interpolate the displacement.
-
-        Args:
-            time_s: Times in seconds, any shape, shared by all trials, float64.
-
-        Returns:
-            Displacement in metres, shape (*trials, *times).
-
-        Raises:
-            ValueError: If a time lies more than one step beyond the track.
-        """
         first, last = float(self.time_s[0]) - self.step_s, float(self.time_s[-1]) + self.step_s
         asked = time_s.detach()
         if asked.numel() and not (float(asked.min()) >= first and float(asked.max()) <= last):
@@ -364,68 +309,3 @@ class MeasuredTrack:
                 f"{float(asked.min()):g} to {float(asked.max()):g} s; record fewer periods or measure a longer track"
             )
         return Spline(self.displacement.to(time_s.device), (float(self.time_s[0]), self.step_s)).at(time_s)
-
-
-def _columns_of(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Times and displacements of a file."""
-    try:
-        if path.suffix not in (".npy", ".npz"):
-            table = _read_text(path)
-        else:
-            stored = ArrayFile(path)
-            if "" not in stored:
-                return stored["time_s"].load("iuf"), stored["displacement_m"].load("iuf")
-            table = stored[""].load("iuf")
-    except (KeyError, OSError, ValueError) as problem:
-        raise ValueError(
-            f"{path}: expected two columns, time in s and displacement in m (.npz: time_s and "
-            f"displacement_m), but {problem}"
-        ) from None
-    if table.ndim != 2 or table.shape[1] != 2:
-        raise ValueError(
-            f"{path}: expected two columns, time in s and displacement in m, got an array of shape {table.shape}"
-        )
-    return table[:, 0], table[:, 1]
-
-
-def _read_text(path: Path) -> np.ndarray:
-    """Numbers of a text file without its comments and its line of names."""
-    lines = [
-        line.replace(",", " ").replace(";", " ")
-        for line in path.read_text().splitlines()
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
-    try:
-        return np.loadtxt(lines, ndmin=2)
-    except ValueError:  # a line of names
-        return np.loadtxt(lines[1:], ndmin=2)
-
-
-def _refuse_empty_band(lowest_hz: Tensor | float, highest_hz: Tensor | float) -> None:
-    """Raise ValueError if the lower end of the band exceeds the upper one in any trial."""
-    if (lowest_hz <= highest_hz) is True:
-        return
-    lowest, highest = (torch.as_tensor(v, dtype=torch.float64).detach() for v in (lowest_hz, highest_hz))
-    lowest, highest = torch.broadcast_tensors(lowest, highest)
-    empty = ~(lowest <= highest)
-    if bool(empty.any()):
-        raise ValueError(
-            "highest_hz of a random motion must not be below lowest_hz, which is by default one cycle in the "
-            f"recording, got {float(highest[empty][0]):g} Hz below {float(lowest[empty][0]):g} Hz; give lowest_hz or "
-            "a larger highest_hz"
-        )
-
-
-def _refuse_band(
-    lowest_hz: Tensor | float | None, highest_hz: Tensor | float | None, slope: Tensor | float, count: int
-) -> None:
-    """Raise ValueError for an empty band, a slope that is not finite or a bad count."""
-    expected = "a random motion needs 0 < lowest_hz <= highest_hz and a finite slope"
-    refuse_unless(expected, slope, finite)
-    for bound in (lowest_hz, highest_hz):
-        if bound is not None:
-            refuse_unless(expected, bound, positive)
-    if lowest_hz is not None and highest_hz is not None:
-        refuse_unless(expected, lowest_hz, lambda x: x <= highest_hz, f"highest_hz is {highest_hz}")
-    if not (isinstance(count, int) and count >= 1):
-        raise ValueError(f"count of sinusoids of a random motion must be a whole number of 1 or more, got {count}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -10,12 +9,13 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchsar.core import Draws
-from torchsar.scene.targets import Scatterers
-from torchsar.scene.trials import finite, refuse_unless, refuse_unless_finite, with_dims
+from torchsar.scene.targets import Scatterers, Scene, unit_phases
+from torchsar.scene.trials import finite, finite_numbers, refuse_unless, with_dims
 
 
 @dataclass(frozen=True)
-class LetterE:
+@finite_numbers("a letter")
+class LetterE(Scene):
     """Letter E of 62 points of amplitude 1.
 
     A spine of 17 points lies along range, 5 cm apart. Three arms of 15 points each lie along
@@ -42,34 +42,21 @@ class LetterE:
     spine_azimuth_m: Tensor | float = -0.075
     random_phase: bool = True
 
-    def __post_init__(self) -> None:
-        refuse_unless_finite("first_range_m of a letter", self.first_range_m)
-        refuse_unless_finite("spine_azimuth_m of a letter", self.spine_azimuth_m)
-
     def scatterers(self, draws: Draws) -> Scatterers:
-        """Draw the phases of the points.
-
-        Args:
-            draws: Source of random numbers.
-
-        Returns:
-            Scatterers of shape (..., 62).
-        """
         spine, along = torch.arange(17, dtype=torch.float64), torch.arange(1, 16, dtype=torch.float64)
         azimuth = torch.cat([torch.zeros(17, dtype=torch.float64), along, along, along])
         row = torch.cat([spine, *(torch.full((15,), float(at), dtype=torch.float64) for at in (0, 8, 16))])
-        turns = (
-            draws.uniform("scene.letter.phase", (62,)) if self.random_phase else torch.zeros(62, dtype=torch.float64)
-        )
+        turns = draws.uniform("scene.letter.phase", (62,)) if self.random_phase else 0.0 * azimuth
         return Scatterers(
             with_dims(self.spine_azimuth_m, 1, azimuth) + 0.01 * azimuth,
             with_dims(self.first_range_m, 1, row) + 0.05 * row,
-            torch.polar(torch.ones_like(turns), 2 * math.pi * turns),
+            unit_phases(turns),
         )
 
 
 @dataclass(frozen=True)
-class RetroAndBrokenLine:
+@finite_numbers("a retro-reflector with a line", line_m=None)
+class RetroAndBrokenLine(Scene):
     """Retro-reflector, and behind it a broken line of 9 points with random phases.
 
     The target stands in for that of the ground experiment, whose layout is not published. The
@@ -101,8 +88,6 @@ class RetroAndBrokenLine:
     line_azimuth_m: Tensor | float = 0.08
 
     def __post_init__(self) -> None:
-        for name in ("range_m", "azimuth_m", "retro_db", "line_db", "line_azimuth_m"):
-            refuse_unless_finite(f"{name} of a retro-reflector with a line", getattr(self, name))
         sentence = "line_m must be the distances (m) of the first and last point of the line behind the retro-reflector"
         if not isinstance(self.line_m, tuple | list) or len(self.line_m) != 2:
             raise ValueError(f"{sentence}, got {self.line_m}")
@@ -110,14 +95,6 @@ class RetroAndBrokenLine:
             refuse_unless(sentence, distance, finite)
 
     def scatterers(self, draws: Draws) -> Scatterers:
-        """Draw the phases of the line.
-
-        Args:
-            draws: Source of random numbers.
-
-        Returns:
-            Scatterers of shape (..., 10), the retro-reflector first.
-        """
         along = torch.tensor([0, 1, 2, 4, 5, 6, 8, 9, 10], dtype=torch.float64) / 10
         first, last = (with_dims(v, 1, along) for v in self.line_m)
         x, r, width, retro_db, line_db = (
@@ -126,7 +103,7 @@ class RetroAndBrokenLine:
         )
         turns = draws.uniform("scene.broken_line.phase", (9,))
         level = 10 ** (retro_db / 20)
-        line = level * 10 ** (line_db / 20) * torch.polar(torch.ones_like(turns), 2 * math.pi * turns)
+        line = level * 10 ** (line_db / 20) * unit_phases(turns)
         retro = torch.zeros_like(line[..., :1]) + level
         across, beyond = width * (along - 0.5), first + (last - first) * along
         return Scatterers(x + pad(across, (1, 0)), r + pad(beyond, (1, 0)), torch.cat([retro, line], -1))

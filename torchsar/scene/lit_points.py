@@ -11,11 +11,8 @@ from torch import Tensor
 
 from torchsar.radar import BistaticRadar
 from torchsar.radar.bistatic import receive_range
-from torchsar.scene.bistatic import Gate
-from torchsar.scene.moving import ExactRange, Movers, ReceiveRange
-
-# pulses, by choice, and frequencies over the band on which neglected phases are evaluated
-_PULSES, _BAND = 513, 17
+from torchsar.scene.bistatic import ExactRange, Gate, ReceiveRange
+from torchsar.scene.movers import Movers
 
 
 @dataclass(frozen=True)
@@ -43,7 +40,7 @@ class LitPoints:
     @cached_property
     def time_s(self) -> Tensor:
         """Slow times in seconds, shape (time,)."""
-        step = max(1, self.n_pulse // _PULSES)
+        step = max(1, self.n_pulse // 513)
         return self.radar.pulse_axis(self.n_pulse).values()[::step]
 
     @cached_property
@@ -89,7 +86,7 @@ class LitPoints:
             Mean of |exp(j phi) - 1|^2 over pulses and range frequencies in dB for the worst point,
             where phi is the phase that the remaining migration causes across the band.
         """
-        radar, frequency_hz = self.radar, torch.linspace(-0.5, 0.5, _BAND, dtype=torch.float64)
+        radar, frequency_hz = self.radar, torch.linspace(-0.5, 0.5, 17, dtype=torch.float64)
         left = ExactRange().range_m(self.movers, self.time_s, radar).mean(-3) - self.movers.range_m[..., None, :]
         if bulk:
             rest = receive_range(self.time_s, 0.0, 0.0, 0.0, radar.reference_range_m, radar.speed_m_s, 0.0)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchsar.radar import TriangularLadar
 from torchsar.radar.ladar import leading
-from torchsar.scene.ladar import Extremes, refuse_unseen_ranges
+from torchsar.scene.ladar_range import Extremes
 from torchsar.scene.targets import Points, Scatterers
 from torchsar.scene.vibration import Motion
 
@@ -76,6 +76,21 @@ class Moved:
                 "or widen gate_m"
             )
         reach = float(ranges[inside].min()), float(ranges[inside].max())
-        refuse_unseen_ranges(radar, *reach)
+        _refuse_unseen_ranges(radar, *reach)
         extremes = Extremes.of(radar, motion, periods, reach, float(azimuth.abs().max()))
         return Moved(azimuth[leads], ranges[leads], float(level[leads].max()), motion, extremes)
+
+
+def _refuse_unseen_ranges(radar: TriangularLadar, near_m: float, far_m: float) -> None:
+    """Raise ValueError for relative ranges of scatterers in metres that no sweep can show."""
+    if near_m <= -radar.reference_range_m:
+        raise ValueError(
+            f"world: a scatterer at the relative range {near_m:g} m lies behind the ladar, whose reference range is "
+            f"{radar.reference_range_m:g} m; ranges of scatterers are relative to it"
+        )
+    reach = radar.sample_rate_hz / 2 / radar.beat_hz(1.0)
+    if max(-near_m, far_m) >= reach:
+        raise ValueError(
+            f"world: relative ranges of scatterers must lie within +-{reach:.4g} m, since larger ranges have beat "
+            f"frequencies that alias, got {near_m:g} to {far_m:g} m; bring the reference range nearer, or sample faster"
+        )

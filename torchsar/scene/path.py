@@ -1,264 +1,158 @@
-"""Range histories and beams of a straight path."""
+"""World of an acquisition from any path: scene and ground, true paths, navigation and beam."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from torchsar.radar import StripmapRadar
-from torchsar.scene.trials import refuse_unless, with_dims
-
-# pulses at the ends of a dwell count as inside: so near, rounding would decide, and differently on
-# each processor
-_TIE = 1e-9
+from torchsar.core import per_trial
+from torchsar.scene.flight import Flight, Navigation
+from torchsar.scene.targets import Scene
+from torchsar.scene.trials import finite_numbers, refuse_unless
 
 
-class Path(Protocol):
-    """Range history of a target on a straight path."""
+class Ground(Protocol):
+    """Height of the ground."""
 
-    def range_m(self, since_s: Tensor, closest_m: Tensor, velocity_m_s: Tensor) -> Tensor:
-        """Return the slant range.
+    def height_m(self, x_m: Tensor, y_m: Tensor) -> Tensor:
+        """Return the height.
 
         Args:
-            since_s: Slow time since closest approach in seconds, float64.
-            closest_m: Closest range in metres, float64.
-            velocity_m_s: Effective velocity in m/s, float64.
+            x_m: Ground coordinates x in metres, shape (..., point), float64.
+            y_m: Ground coordinates y in metres, same shape.
 
         Returns:
-            Slant range in metres; all arguments broadcast.
-        """
-        ...
-
-    def neglected_phase_rad(self, radar: StripmapRadar, range_m: float, since_s: float) -> float:
-        """Return the largest phase that this range history neglects within an aperture.
-
-        Args:
-            radar: Radar parameters.
-            range_m: Closest range in metres.
-            since_s: Slow time of the aperture end since closest approach in seconds.
-
-        Returns:
-            Phase in radians.
+            Height z in metres, shape (..., point), float64.
         """
         ...
 
 
 @dataclass(frozen=True)
-class Hyperbola:
-    """Exact range history of a straight path, r(t) = sqrt(r0^2 + v^2 t^2), constant during a pulse.
-
-    The history neglects the motion within the pulse. The Doppler shift, which this motion causes,
-    would displace the echo of a chirp in range and change its phase.
-    """
-
-    def range_m(self, since_s: Tensor, closest_m: Tensor, velocity_m_s: Tensor) -> Tensor:
-        """Return the slant range.
-
-        Args:
-            since_s: Slow time since closest approach in seconds, float64.
-            closest_m: Closest range in metres, float64.
-            velocity_m_s: Effective velocity in m/s, float64.
-
-        Returns:
-            Slant range in metres; all arguments broadcast.
-        """
-        x2 = (velocity_m_s * since_s).square()
-        return closest_m + x2 / (torch.sqrt(closest_m.square() + x2) + closest_m)
-
-    def neglected_phase_rad(self, radar: StripmapRadar, range_m: float, since_s: float) -> float:
-        """Return the phase at the ends of the pulse due to motion within the pulse.
-
-        The phase is pi f_d T, with the Doppler shift f_d at the end of the aperture relative to
-        that at closest approach, and the length T of the pulse.
-
-        Args:
-            radar: Radar parameters.
-            range_m: Closest range in metres.
-            since_s: Slow time of the aperture end since closest approach in seconds.
-
-        Returns:
-            Phase in radians.
-        """
-        closing = radar.velocity_m_s**2 * since_s / math.hypot(range_m, radar.velocity_m_s * since_s)
-        return 2 * math.pi * closing / radar.wavelength_m * radar.pulse.duration_s
-
-
-@dataclass(frozen=True)
-class Parabola:
-    """Second-order range history, r(t) = r0 + v^2 t^2 / (2 r0).
-
-    This range history neglects the terms of the hyperbola from t^4 on; see `neglected_phase_rad`.
-
-    Reference:
-        Tsvetkov 2017, Eq. (2).
-    """
-
-    def range_m(self, since_s: Tensor, closest_m: Tensor, velocity_m_s: Tensor) -> Tensor:
-        """Return the slant range.
-
-        Args:
-            since_s: Slow time since closest approach in seconds, float64.
-            closest_m: Closest range in metres, float64.
-            velocity_m_s: Effective velocity in m/s, float64.
-
-        Returns:
-            Slant range in metres; all arguments broadcast.
-        """
-        return closest_m + (velocity_m_s * since_s).square() / (2 * closest_m)
-
-    def neglected_db(
-        self, radar: StripmapRadar, doppler_hz: float, velocity_m_s: float, range_m: float, dwell_s: float
-    ) -> float:
-        """Predict the relative error of the echo of a target, mean |exp(j phi) - 1|^2 in dB.
-
-        phi is the phase difference between the echoes by the parabola and by the exact hyperbola;
-        the mean is over the time for which the target is illuminated.
-
-        Args:
-            radar: Radar parameters.
-            doppler_hz: Doppler of the beam centre in Hz.
-            velocity_m_s: Effective velocity in m/s.
-            range_m: Slant range of the target at the beam centre in metres.
-            dwell_s: Time for which the target is illuminated in seconds.
-
-        Returns:
-            Error in dB.
-        """
-        sine = radar.sin_squint(doppler_hz, velocity_m_s)
-        closest, velocity = range_m * torch.sqrt(1 - sine**2), torch.tensor(velocity_m_s, dtype=torch.float64)
-        since = range_m * sine / velocity_m_s + dwell_s * torch.linspace(-0.5, 0.5, 65, dtype=torch.float64)
-        wrong = self.range_m(since, closest, velocity) - Hyperbola().range_m(since, closest, velocity)
-        error = float((2 - 2 * torch.cos(4 * math.pi / radar.wavelength_m * wrong)).mean())
-        return 10 * math.log10(max(error, 1e-30))
-
-    def neglected_phase_rad(self, radar: StripmapRadar, range_m: float, since_s: float) -> float:
-        """Return the phase difference to the exact hyperbola at the end of the aperture.
-
-        The phase is about pi x^4 / (2 lambda r^3), with the closest range r and the along-track
-        distance x of the end of the aperture from closest approach.
-
-        Args:
-            radar: Radar parameters.
-            range_m: Closest range in metres.
-            since_s: Slow time of the aperture end since closest approach in seconds.
-
-        Returns:
-            Phase in radians.
-        """
-        x2 = (radar.velocity_m_s * since_s) ** 2
-        exact = x2 / (math.sqrt(range_m**2 + x2) + range_m)
-        return 4 * math.pi / radar.wavelength_m * (x2 / (2 * range_m) - exact)
-
-
-class Beam(Protocol):
-    """Two-way illumination of a target."""
-
-    def weight(self, since_s: Tensor, doppler_offset_hz: Tensor, velocity_m_s: Tensor) -> Tensor:
-        """Return the two-way amplitude gain.
-
-        Args:
-            since_s: Slow time since the beam centre crossed the target in seconds, shape (...,
-                pulse, target), float64.
-            doppler_offset_hz: Doppler frequency of the target relative to the beam centre in hertz,
-                same shape.
-            velocity_m_s: Effective velocity in m/s, broadcastable.
-
-        Returns:
-            Gain, shape (..., pulse, target), float64.
-        """
-        ...
-
-
-@dataclass(frozen=True)
-class AlwaysLit:
-    """Beam that illuminates every target in every pulse."""
-
-    def weight(self, since_s: Tensor, doppler_offset_hz: Tensor, velocity_m_s: Tensor) -> Tensor:
-        """Return the two-way amplitude gain, which is one for every pulse and target.
-
-        Args:
-            since_s: Slow time since the beam centre crossed the target in seconds, shape (...,
-                pulse, target), float64.
-            doppler_offset_hz: Doppler frequency of the target relative to the beam centre in hertz,
-                same shape.
-            velocity_m_s: Effective velocity in m/s, broadcastable.
-
-        Returns:
-            Gain, shape (..., pulse, target), float64.
-        """
-        return torch.ones_like(since_s)
-
-
-@dataclass(frozen=True)
-class Dwell:
-    """Beam of constant gain and limited dwell time.
+@finite_numbers("a ground plane")
+class PlaneGround(Ground):
+    """Plane z = height + slope_x x + slope_y y.
 
     Args:
-        dwell_s: Time for which a target is illuminated, centred on its crossing of the beam centre,
-            in seconds.
+        level_m: Height at x = y = 0 in metres.
+        slope_x: Slope along x in metres per metre.
+        slope_y: Slope along y in metres per metre.
 
     Raises:
-        ValueError: If the time is not positive.
+        ValueError: If a number is not finite.
     """
 
-    dwell_s: Tensor | float
+    level_m: Tensor | float = 0.0
+    slope_x: Tensor | float = 0.0
+    slope_y: Tensor | float = 0.0
 
-    def __post_init__(self) -> None:
-        refuse_unless("dwell_s must be a positive number of seconds", self.dwell_s, lambda x: x > 0)
-
-    def weight(self, since_s: Tensor, doppler_offset_hz: Tensor, velocity_m_s: Tensor) -> Tensor:
-        """Return the two-way amplitude gain, one during the dwell time and zero elsewhere.
-
-        Args:
-            since_s: Slow time since the beam centre crossed the target in seconds, shape (...,
-                pulse, target), float64.
-            doppler_offset_hz: Doppler frequency of the target relative to the beam centre in hertz,
-                same shape.
-            velocity_m_s: Effective velocity in m/s, broadcastable.
-
-        Returns:
-            Gain, shape (..., pulse, target), float64.
-        """
-        half = with_dims(self.dwell_s, 2, since_s) / 2
-        return (since_s.abs() <= half * (1 + _TIE)).to(since_s.dtype)
+    def height_m(self, x_m: Tensor, y_m: Tensor) -> Tensor:
+        level, a, b = (per_trial(v, 1, x_m) for v in (self.level_m, self.slope_x, self.slope_y))
+        return level + a * x_m + b * y_m
 
 
 @dataclass(frozen=True)
-class Antenna:
-    """Beam of a uniform aperture, side lobes included.
+@finite_numbers("a beam", width_deg=None)
+class SideBeam:
+    """Beam of a uniform aperture along the heading, with pointing errors.
 
-    The two-way amplitude gain is sinc^2(length_m f / (2 v)) at the Doppler frequency f relative to
-    the beam centre, with the velocity v and sinc(x) = sin(pi x) / (pi x).
+    The one-way amplitude gain is sinc(x), where x is proportional to the difference between the
+    sines of two angles ahead of broadside: that of the line of sight, and that of the beam centre,
+    squint + yaw + sway sin(2 pi f t).
 
     Args:
-        length_m: Length of the aperture in metres.
+        width_deg: One-way half-power width in degrees.
+        squint_deg: Nominal angle of the beam centre ahead of broadside in degrees.
+        yaw_deg: Constant pointing error in degrees.
+        sway_deg: Amplitude of a sinusoidal pointing error in degrees.
+        sway_hz: Its frequency in hertz.
 
     Raises:
-        ValueError: If the length is not positive.
+        ValueError: If a number is not finite or the width is not between 0 and 180 degrees.
     """
 
-    length_m: Tensor | float
+    width_deg: Tensor | float
+    squint_deg: Tensor | float = 0.0
+    yaw_deg: Tensor | float = 0.0
+    sway_deg: Tensor | float = 0.0
+    sway_hz: Tensor | float = 0.0
 
     def __post_init__(self) -> None:
-        refuse_unless("length_m must be a positive number of metres", self.length_m, lambda x: x > 0)
+        within = "width_deg of a beam must be a number between 0 and 180 degrees, or one per trial"
+        refuse_unless(within, self.width_deg, lambda x: (x > 0) & (x < 180))
 
-    def weight(self, since_s: Tensor, doppler_offset_hz: Tensor, velocity_m_s: Tensor) -> Tensor:
-        """Return the two-way amplitude gain of the uniform aperture, sinc^2(length_m f / (2 v)).
-
-        f is the Doppler offset, v the velocity, and sinc(x) = sin(pi x) / (pi x).
+    def gain(self, time_s: Tensor, ahead: Tensor) -> Tensor:
+        """Return the one-way amplitude gain.
 
         Args:
-            since_s: Slow time since the beam centre crossed the target in seconds, shape (...,
-                pulse, target), float64.
-            doppler_offset_hz: Doppler frequency of the target relative to the beam centre in hertz,
-                same shape.
-            velocity_m_s: Effective velocity in m/s, broadcastable.
+            time_s: Times since the first pulse in seconds, shape (pulse,), float64.
+            ahead: Sine of the angle of the line of sight ahead of broadside, shape (..., pulse,
+                point).
 
         Returns:
-            Gain, shape (..., pulse, target), float64.
+            Gain, shape (..., pulse, point), float64.
         """
-        return torch.sinc(with_dims(self.length_m, 2, since_s) * doppler_offset_hz / (2 * velocity_m_s)).square()
+        width, squint, yaw, sway, hz = (
+            per_trial(v, 2, time_s)
+            for v in (self.width_deg, self.squint_deg, self.yaw_deg, self.sway_deg, self.sway_hz)
+        )
+        centre = squint + yaw + sway * torch.sin(2 * math.pi * hz * time_s[:, None])
+        off = ahead - torch.sin(torch.deg2rad(centre))
+        # sinc^2(0.442946) = 1/2
+        return torch.sinc(0.442946 * off / torch.sin(torch.deg2rad(width) / 2))
+
+    def mean_power(self, ahead: Tensor) -> Tensor:
+        """Return the two-way power gain of an antenna that transmits and receives.
+
+        It is the mean over a period of the sway.
+
+        Args:
+            ahead: Sine of the angle of the line of sight ahead of broadside, shape (point,).
+
+        Returns:
+            Gain, shape (..., point), float64.
+        """
+        time_s = torch.arange(64, dtype=torch.float64) / 64
+        beam = replace(self, sway_hz=torch.as_tensor(self.sway_hz).sign())  # one period in a second, if it sways
+        return beam.gain(time_s, ahead.expand(64, -1)).pow(4).mean(-2)
+
+
+@dataclass(frozen=True)
+@finite_numbers(window_range_m=0.0)
+class PathWorld:
+    """Scene seen from any path, by one antenna or by a transmitter and a receiver.
+
+    A scatterer lies at x = range, y = azimuth, z = height of the ground. The middle of the range
+    window, to which phases refer, follows the point (0, 0, 0) as navigation sees it, or has a
+    constant range. Echoes beyond the window are not recorded.
+
+    Args:
+        scene: Scatterers.
+        transmitter: True path of the transmitter.
+        receiver: True path of the receiver; None if both share an antenna.
+        navigation: What is recorded of the path of the transmitter.
+        receiver_navigation: What is recorded of the path of the receiver.
+        ground: Height of the ground.
+        beam: Beam of the receiver, and of the transmitter if they share an antenna; None if the
+            scene is always lit.
+        window_range_m: Constant range of the middle of the window in metres, half the path of a
+            bistatic pair; None to follow the middle of the scene.
+        snr_db: Mean power of the samples of lit pulses over the noise variance in decibels, None
+            for no noise.
+
+    Raises:
+        ValueError: If a number is not finite, or the range is negative.
+    """
+
+    scene: Scene
+    transmitter: Flight
+    receiver: Flight | None = None
+    navigation: Navigation = field(default_factory=Navigation)
+    receiver_navigation: Navigation = field(default_factory=Navigation)
+    ground: Ground = field(default_factory=PlaneGround)
+    beam: SideBeam | None = None
+    window_range_m: float | None = None
+    snr_db: Tensor | float | None = None

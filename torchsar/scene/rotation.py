@@ -13,11 +13,13 @@ import torch
 from torch import Tensor
 
 from torchsar.core import per_trial
+from torchsar.radar import InverseRadar
 from torchsar.radar.warp import least_rate, warp, warp_rate
-from torchsar.scene.trials import refuse_unless_finite
+from torchsar.scene.trials import finite_numbers, refuse_unless_finite
 
 
 @dataclass(frozen=True)
+@finite_numbers("a rotation", k=None)
 class PolynomialRotation:
     """Rotation with a polynomial angle, theta(t) = omega (t + k1 t^2 / 2! + k2 t^3 / 3! + ...).
 
@@ -43,7 +45,6 @@ class PolynomialRotation:
     k: Sequence[Tensor | float] | Tensor = ()
 
     def __post_init__(self) -> None:
-        refuse_unless_finite("omega_rad_s of a rotation", self.omega_rad_s)
         for order, value in enumerate(self._terms(), start=1):
             refuse_unless_finite(f"k{order} of a rotation", value)
 
@@ -155,3 +156,30 @@ class PolynomialRotation:
                 f"{duration_s:.6g} s of the record, so that two times have the same "
                 "angle and no image can be formed; choose smaller k1, k2, ..., or record fewer pulses"
             )
+
+
+Rotation = Tensor | float | PolynomialRotation
+
+
+def rotation_angle(radar: InverseRadar, n_pulse: int, rotation: Rotation, like: Tensor) -> Tensor:
+    """Return the rotation angle at the middle of each pulse.
+
+    Args:
+        radar: Radar parameters.
+        n_pulse: Number of pulses.
+        rotation: Rate in rad/s of a uniform rotation, a number or one value per trial, with the
+            angle zero at pulse n_pulse // 2; or a PolynomialRotation, with the angle zero at the
+            first pulse.
+        like: Tensor that gives the device.
+
+    Returns:
+        Angle in radians, shape (*trials, pulse), float64.
+
+    Raises:
+        ValueError: If the rate of a PolynomialRotation falls to zero within the record.
+    """
+    pulse = torch.arange(n_pulse, dtype=torch.float64, device=like.device)
+    if isinstance(rotation, PolynomialRotation):
+        rotation.refuse_turning_back(n_pulse / radar.prf_hz)
+        return rotation.angle(pulse / radar.prf_hz)
+    return per_trial(rotation, 1, like) * ((pulse - n_pulse // 2) / radar.prf_hz)

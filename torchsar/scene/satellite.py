@@ -12,23 +12,20 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws
-from torchsar.scene.targets import Scatterers
-from torchsar.scene.trials import either, positive, refuse_unless, refuse_unless_finite, stacked, with_dims
+from torchsar.scene.targets import Scatterers, Scene
+from torchsar.scene.trials import either, finite_numbers, refuse_unless, stacked, with_dims
 
 # Proportions of the body, chosen here; only the panel tip at 6.43 m is published. The axes before
 # the tilt are: along the panels, along the line of sight away from the radar, and across both. The
 # whole is scaled to the given extents.
 _BUS = (0.7, 1.3, 1.2)  # half sides
 _PANEL = (0.8, 6.43, 1.9)  # first and last position along the panels, half chord
-_BAYS, _STRINGS = 4, 8  # cells of a panel grid along and across
-# position along the panels, position of the vertex on the line of sight, radius of the rim, depth
-_DISH = (0.2, -1.5, 1.2, 0.8)
-_FEED = -3.1  # position of the feed on the line of sight
-_BOOM = ((-0.3, 1.3, 0.3), (-0.5, 3.5, 0.3))  # root and tip
-_CROSSBAR = 0.45  # half length
+# position along the panels, then on the line of sight the vertex and the feed, radius of the rim,
+# depth
+_DISH = (0.2, -1.5, -3.1, 1.2, 0.8)
+_BOOM = ((-0.3, 1.3, 0.3), (-0.5, 3.5, 0.3), (0.45, 0.0, 0.0))  # root, tip, half of the crossbar
 # fractions of the scatterers, by choice
 _SHARES = {"bus": 0.26, "panel_left": 0.29, "panel_right": 0.29, "dish": 0.08, "boom": 0.08}
-_LEAST = 60  # by choice: each part then has more points than corners
 
 
 class _Part(Protocol):
@@ -95,10 +92,8 @@ class _Panel:
         return self._at(_table([0, 0, 1, 1]), _table([-1, 1, -1, 1]))
 
     def points(self, u: Tensor) -> Tensor:
-        ribs, strings = (
-            torch.linspace(0, 1, _BAYS + 1, dtype=torch.float64),
-            torch.linspace(-1, 1, _STRINGS + 1, dtype=torch.float64),
-        )
+        # a grid of 4 cells along and 8 across
+        ribs, strings = (torch.linspace(at, 1, n, dtype=torch.float64) for at, n in ((0, 5), (-1, 9)))
         one_rib, one_string = torch.ones_like(ribs), torch.ones_like(strings)
         starts = torch.cat([self._at(ribs, -one_rib), self._at(0 * one_string, strings)])
         ends = torch.cat([self._at(ribs, one_rib), self._at(one_string, strings)])
@@ -109,11 +104,11 @@ class _Dish:
     """Paraboloid that opens towards the radar, with the ends of its rim and its feed."""
 
     def corners(self) -> Tensor:
-        along, vertex, radius, depth = _DISH
-        return _table([(along, _FEED, 0), (along, vertex - depth, -radius), (along, vertex - depth, radius)])
+        along, vertex, feed, radius, depth = _DISH
+        return _table([(along, feed, 0), (along, vertex - depth, -radius), (along, vertex - depth, radius)])
 
     def points(self, u: Tensor) -> Tensor:
-        along, vertex, radius, depth = _DISH
+        along, vertex, _, radius, depth = _DISH
         out, turn = _spread(u[..., 0]), 2 * math.pi * u[..., 1]
         reach = radius * torch.sqrt(out)
         return torch.stack([along + reach * torch.cos(turn), vertex - depth * out, reach * torch.sin(turn)], -1)
@@ -126,8 +121,7 @@ class _Boom:
         return _table([_BOOM[1]])
 
     def points(self, u: Tensor) -> Tensor:
-        root, tip = _table(_BOOM)
-        arm = _table((_CROSSBAR, 0, 0))
+        root, tip, arm = _table(_BOOM)
         return _on_lines(torch.stack([root, tip - arm]), torch.stack([tip, tip + arm]), _spread(u[..., 0]))
 
 
@@ -142,7 +136,8 @@ _PARTS: Mapping[str, _Part] = {
 
 
 @dataclass(frozen=True)
-class Satellite:
+@finite_numbers("a satellite", half_width_m="positive", half_depth_m="positive", corner_level="positive")
+class Satellite(Scene):
     """Satellite of random scatterers: box, two gridded panels, dish and boom.
 
     The box has 26 % of the scatterers, each panel 29 %, dish and boom 8 % each. The panels lie
@@ -178,13 +173,10 @@ class Satellite:
     corner_level: Tensor | float = 1.5
 
     def __post_init__(self) -> None:
-        if self.count < _LEAST:
+        if self.count < 60:  # each part then has more points than corners
             raise ValueError(
-                f"a satellite needs at least {_LEAST} scatterers to have all of its parts, got count={self.count}"
+                f"a satellite needs at least 60 scatterers to have all of its parts, got count={self.count}"
             )
-        for name in ("half_width_m", "half_depth_m", "corner_level"):
-            refuse_unless(f"{name} of a satellite must be a positive number", getattr(self, name), positive)
-        refuse_unless_finite("tilt_rad of a satellite", self.tilt_rad)
         refuse_unless(
             "tilt_rad of a satellite must lie within +-pi/4",
             self.tilt_rad,
@@ -229,22 +221,10 @@ class Satellite:
         return (((projected - low) - (high - projected)) / (high - low)).clamp(-1, 1) * half
 
     def scatterers(self, draws: Draws) -> Scatterers:
-        """Draw positions, amplitudes and phases.
-
-        Args:
-            draws: Random draws.
-
-        Returns:
-            Scatterers of shape (..., count); `azimuth_m` is cross range.
-        """
         u = draws.uniform("scene.satellite.place", (self.count, 3))
-        positions = self._fitted(
-            self._projected(
-                torch.cat(
-                    [_part_points(_PARTS[name], u[..., members, :]) for name, members in self.parts().items()], -2
-                )
-            )
-        )
+        members = self.parts().items()
+        body = torch.cat([_part_points(_PARTS[name], u[..., part, :]) for name, part in members], -2)
+        positions = self._fitted(self._projected(body))
         rayleigh = torch.sqrt(-2 * torch.log1p(-draws.uniform("scene.satellite.level", (self.count,))))
         level = torch.where(self.corners(), with_dims(self.corner_level, 1, rayleigh), 0.4 + 0.6 * rayleigh)
         phase = 2 * math.pi * draws.uniform("scene.satellite.phase", (self.count,))

@@ -6,24 +6,27 @@ import functools
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import ArrayFile, Draws, real_dtype, refuse_non_finite
-from torchsar.scene.trials import positive, refuse_unless, refuse_unless_finite, with_dims
+from torchsar.core import Draws, real_dtype, refuse_non_finite
+from torchsar.scene.trials import finite_numbers, refuse_unless, with_dims
 
-# limits of the shape of a gamma distribution, between which the table is checked
-_SHAPES = (0.1, 1000.0)
 # range in standard deviations and number of entries of the table of gamma numbers: linear
 # interpolation between them errs by less than 1e-4
 _REACH, _NODES = 9.0, 4097
 
 
+def _is_shape(x: Any) -> Any:
+    """Whether a gamma distribution has a shape for which the table was checked, 0.1 to 1000."""
+    return (x >= 0.1) & (x <= 1000)
+
+
 @dataclass(frozen=True, kw_only=True)
+@finite_numbers("a sea", margin_s=None)
 class Sea(ABC):
     """Surface of independent circular Gaussian scatterers with a local mean intensity.
 
@@ -57,7 +60,6 @@ class Sea(ABC):
     lobes: int = 1
 
     def __post_init__(self) -> None:
-        refuse_unless_finite("power_db of a sea", self.power_db)
         if self.margin_s is not None and not (math.isfinite(self.margin_s) and self.margin_s >= 0):
             raise ValueError(
                 "margin_s of a sea must be 0 s or more, or None to reach to the edge of the illumination, got "
@@ -162,9 +164,9 @@ class KSea(Sea):
     def __post_init__(self) -> None:
         super().__post_init__()
         refuse_unless(
-            f"shape of a K sea must lie in {_SHAPES[0]:g}..{_SHAPES[1]:g}, or be inf for pure speckle",
+            "shape of a K sea must lie in 0.1..1000, or be inf for pure speckle",
             self.shape,
-            lambda x: ((x >= _SHAPES[0]) & (x <= _SHAPES[1])) | (x == math.inf),
+            lambda x: _is_shape(x) | (x == math.inf),
         )
         if len(self.cell_m) != 2 or not all(math.isfinite(side) and side > 0 for side in self.cell_m):
             raise ValueError(
@@ -172,19 +174,6 @@ class KSea(Sea):
             )
 
     def texture(self, azimuth_m: Tensor, range_m: Tensor, draws: Draws) -> tuple[Tensor, Tensor, Tensor]:
-        """Draw the texture, gamma-distributed mean intensities of rectangular cells.
-
-        Args:
-            azimuth_m: Along-track positions of a grid in metres, shape (a,), float64.
-            range_m: Range positions of the grid in metres, shape (r,), float64.
-            draws: Random draws.
-
-        Returns:
-            The tensors table, row and column. Grid cell (i, j) has the mean intensity
-            table[..., row[..., i], column[..., j]]. The table has the shape (..., rows, columns),
-            float64, and unit mean. The indices have the shapes (a,) or (..., a) for row, and (r,)
-            or (..., r) for column, int64.
-        """
         row, column = (
             _cells(positions, side) for positions, side in zip((azimuth_m, range_m), self.cell_m, strict=True)
         )
@@ -196,6 +185,7 @@ class KSea(Sea):
 
 
 @dataclass(frozen=True, eq=False)
+@finite_numbers("an image", azimuth_extent_m="positive", range_extent_m="positive")
 class ImageReflectivity(Sea):
     """Surface whose mean intensity is a given image; each trial draws its own speckle.
 
@@ -235,8 +225,6 @@ class ImageReflectivity(Sea):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("azimuth_extent_m", "range_extent_m"):
-            refuse_unless(f"{name} of an image must be a positive number of metres", getattr(self, name), positive)
         image = torch.as_tensor(self.intensity)
         image = (image.abs().square() if image.is_complex() else image).to(torch.float64)
         if image.ndim < 2 or not image.numel():
@@ -251,52 +239,10 @@ class ImageReflectivity(Sea):
             )
         object.__setattr__(self, "intensity", image)
 
-    @staticmethod
-    def from_file(
-        path: str | Path,
-        azimuth_extent_m: Tensor | float,
-        range_extent_m: Tensor | float,
-        key: str | None = None,
-        **changes: Any,
-    ) -> ImageReflectivity:
-        """Read the image from a .npy or .npz file.
-
-        Args:
-            path: Path of the file.
-            azimuth_extent_m: Along-track extent of the image in metres.
-            range_extent_m: Range extent of the image in metres.
-            key: Name of the array in an .npz file, not needed if it holds only one.
-            **changes: Further parameters of `ImageReflectivity`, by name.
-
-        Returns:
-            The surface.
-
-        Raises:
-            FileNotFoundError: If the file does not exist.
-            ValueError: If the file holds no array of plain numbers with the name `key`, or several
-                arrays and no `key` is given; or as for `ImageReflectivity`.
-        """
-        return ImageReflectivity(_image(Path(path), key), azimuth_extent_m, range_extent_m, **changes)
-
     def texture(self, azimuth_m: Tensor, range_m: Tensor, draws: Draws) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the image, normalised to a mean of one.
-
-        Args:
-            azimuth_m: Along-track positions of a grid in metres, shape (a,), float64.
-            range_m: Range positions of the grid in metres, shape (r,), float64.
-            draws: Random draws.
-
-        Returns:
-            The tensors table, row and column. Grid cell (i, j) has the mean intensity
-            table[..., row[..., i], column[..., j]]. The table has the shape (..., rows, columns),
-            float64, and unit mean. The indices have the shapes (a,) or (..., a) for row, and (r,)
-            or (..., r) for column, int64.
-        """
         image = self.intensity.to(azimuth_m.device)
-        row, column = (
-            _mirrored(azimuth_m / with_dims(self.azimuth_extent_m, 1, azimuth_m), image.shape[-2]),
-            _mirrored(range_m / with_dims(self.range_extent_m, 1, range_m), image.shape[-1]),
-        )
+        extents = zip((azimuth_m, range_m), (self.azimuth_extent_m, self.range_extent_m), image.shape[-2:])
+        row, column = (_mirrored(at / with_dims(extent, 1, at), n) for at, extent, n in extents)
         return image / image.mean((-2, -1), keepdim=True), row, column
 
 
@@ -338,15 +284,12 @@ def gamma_from_normal(x: Tensor, shape: Tensor | float) -> Tensor:
 @functools.lru_cache
 def _gamma_table(shape: float) -> Tensor:
     """Logarithm of the gamma number at equally spaced normal numbers, by bisection."""
-    if not _SHAPES[0] <= shape <= _SHAPES[1]:
-        raise ValueError(f"shape of a gamma distribution must lie in {_SHAPES[0]:g}..{_SHAPES[1]:g}, got {shape}")
+    refuse_unless("shape of a gamma distribution must lie in 0.1..1000", shape, _is_shape)
     x = torch.linspace(-_REACH, _REACH, _NODES, dtype=torch.float64)
     # the smaller tail probability of each number is matched, which keeps its digits
     tail, order = torch.special.ndtr(-x.abs()), torch.full_like(x, shape)
-    low, high = (
-        torch.full_like(x, -60 / min(shape, 1.0)),
-        torch.full_like(x, math.log(shape + 60 * math.sqrt(shape) + 100)),
-    )
+    low = torch.full_like(x, -60 / min(shape, 1.0))
+    high = torch.full_like(x, math.log(shape + 60 * math.sqrt(shape) + 100))
     for _ in range(60):
         middle = (low + high) / 2
         value = torch.exp(middle)
@@ -367,18 +310,3 @@ def _mirrored(share: Tensor, n: int) -> Tensor:
     """Pixel of n for positions in units of the extent; image and mirrored image alternate."""
     pixel = torch.remainder(torch.floor((share + 0.5) * n).to(torch.int64), 2 * n)
     return torch.minimum(pixel, 2 * n - 1 - pixel)
-
-
-def _image(path: Path, key: str | None) -> Tensor:
-    """The image in a file."""
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"{path} does not exist; give the path of a .npy or .npz file with the image of a surface"
-        )
-    arrays = ArrayFile(path)
-    name = next(iter(arrays)) if key is None and len(arrays) == 1 else key
-    if name is None or name not in arrays:
-        raise ValueError(
-            f"{path} holds the arrays {list(arrays)}; give the name of one of them as key, got key={key!r}"
-        )
-    return torch.as_tensor(arrays[name].load("biufc"))

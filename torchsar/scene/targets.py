@@ -12,7 +12,14 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws
-from torchsar.scene.trials import finite, refuse_unless, refuse_unless_finite, stacked, with_dims
+from torchsar.scene.trials import (
+    finite,
+    finite_numbers,
+    refuse_unless,
+    refuse_unless_finite,
+    stacked,
+    with_dims,
+)
 
 
 @dataclass(frozen=True)
@@ -38,27 +45,35 @@ class Scatterers:
     amplitude: Tensor
 
     def __post_init__(self) -> None:
-        shapes = {tuple(x.shape) for x in (self.azimuth_m, self.range_m, self.amplitude)}
-        if (
-            self.azimuth_m.dtype != torch.float64
-            or self.range_m.dtype != torch.float64
-            or not self.amplitude.is_complex()
-        ):
-            raise TypeError(
-                "scatterers need float64 positions and complex amplitudes, got "
-                f"{self.azimuth_m.dtype}, {self.range_m.dtype}, {self.amplitude.dtype}"
-            )
+        shapes = {tuple(x.shape) for x in self.tensors}
+        dtypes = [x.dtype for x in self.tensors]
+        if any(dtype != torch.float64 for dtype in dtypes[:2]) or not dtypes[2].is_complex:
+            raise TypeError(f"scatterers need float64 positions and complex amplitudes, got {dtypes}")
         if len({s[-1] for s in shapes}) != 1:
             raise ValueError(f"scatterers need as many ranges and amplitudes as azimuths, got shapes {sorted(shapes)}")
 
+    @property
+    def tensors(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Azimuth, range and amplitude."""
+        return self.azimuth_m, self.range_m, self.amplitude
 
-def _refuse_empty(count: int, *extents_m: Tensor | float) -> None:
-    """Raise ValueError for a scene without scatterers or with negative extents."""
-    sentence = "a random scene needs at least one scatterer and extents of 0 m or more"
-    if count < 1:
-        raise ValueError(f"{sentence}, got count={count}")
-    for extent in extents_m:
-        refuse_unless(sentence, extent, lambda x: finite(x) & (x >= 0))
+    def to(self, device: torch.device | str | None) -> Scatterers:
+        """Return the scatterers on a device; raises ValueError if there are none."""
+        if not self.azimuth_m.shape[-1]:
+            raise ValueError("the scene holds no scatterer; give it at least one")
+        return Scatterers(*(x.to(device) for x in self.tensors))
+
+
+def unit_phases(turns: Tensor) -> Tensor:
+    """Return the complex numbers of magnitude one whose phases are given.
+
+    Args:
+        turns: Phases in cycles, any shape, float64.
+
+    Returns:
+        exp(2j pi turns) of the same shape, complex128.
+    """
+    return torch.polar(torch.ones_like(turns), 2 * math.pi * turns)
 
 
 class Scene(Protocol):
@@ -77,7 +92,8 @@ class Scene(Protocol):
 
 
 @dataclass(frozen=True)
-class Points:
+@finite_numbers("points")
+class Points(Scene):
     """Given points.
 
     Every parameter is a list with one entry per target; each entry is a number or one value per
@@ -104,28 +120,48 @@ class Points:
             raise ValueError(
                 f"points need as many ranges (and amplitudes, where given) as azimuths, got lists of lengths {counts}"
             )
-        for name in ("azimuth_m", "range_m", "amplitude"):
-            refuse_unless_finite(f"{name} of points", getattr(self, name))
 
     def scatterers(self, draws: Draws) -> Scatterers:
-        """Draw the phases of the points.
-
-        Args:
-            draws: Random draws.
-
-        Returns:
-            Scatterers of shape (..., target).
-        """
         x, r = stacked(self.azimuth_m), stacked(self.range_m)
         level = torch.ones_like(x) if self.amplitude is None else stacked(self.amplitude)
         turns = draws.uniform("scene.points.phase", x.shape[-1:]) if self.random_phase else torch.zeros_like(x)
-        if not x.shape == r.shape == level.shape == turns.shape:
-            x, r, level, turns = torch.broadcast_tensors(x, r, level, turns)
+        x, r, level, turns = torch.broadcast_tensors(x, r, level, turns)
         return Scatterers(x, r, torch.polar(level, 2 * math.pi * turns))
 
 
 @dataclass(frozen=True)
-class RandomPoints:
+class _Rectangle(Scene):
+    """Base of scenes of random scatterers in a rectangle."""
+
+    count: int
+    azimuth_extent_m: Tensor | float
+    range_extent_m: Tensor | float
+    azimuth_m: Tensor | float = 0.0
+    range_m: Tensor | float = 0.0
+
+    def __post_init__(self) -> None:
+        sentence = "a random scene needs at least one scatterer and extents of 0 m or more"
+        if self.count < 1:
+            raise ValueError(f"{sentence}, got count={self.count}")
+        for extent in (self.azimuth_extent_m, self.range_extent_m):
+            refuse_unless(sentence, extent, lambda x: finite(x) & (x >= 0))
+        for name in ("azimuth_m", "range_m"):
+            refuse_unless_finite(f"{name} of random scatterers", getattr(self, name))
+
+    def _places(self, draws: Draws, purpose: str) -> tuple[Tensor, Tensor]:
+        """Random azimuth and range of the scatterers, (..., target) each."""
+        shares = [draws.uniform(f"{purpose}.{name}", (self.count,)) for name in ("azimuth", "range")]
+        middles, extents = (self.azimuth_m, self.range_m), (self.azimuth_extent_m, self.range_extent_m)
+        x, r = (
+            with_dims(middle, 1, share) + with_dims(extent, 1, share) * (share - 0.5)
+            for middle, extent, share in zip(middles, extents, shares, strict=True)
+        )
+        return x, r
+
+
+@dataclass(frozen=True)
+@finite_numbers("random points")
+class RandomPoints(_Rectangle):
     """Points at random positions in a rectangle, with random powers and phases.
 
     Args:
@@ -141,36 +177,18 @@ class RandomPoints:
         ValueError: If there is no scatterer, an extent is negative or a number is not finite.
     """
 
-    count: int
-    azimuth_extent_m: Tensor | float
-    range_extent_m: Tensor | float
-    azimuth_m: Tensor | float = 0.0
-    range_m: Tensor | float = 0.0
     spread_db: Tensor | float = 0.0
 
-    def __post_init__(self) -> None:
-        _refuse_empty(self.count, self.azimuth_extent_m, self.range_extent_m)
-        for name in ("azimuth_m", "range_m", "spread_db"):
-            refuse_unless_finite(f"{name} of random points", getattr(self, name))
-
     def scatterers(self, draws: Draws) -> Scatterers:
-        """Draw positions, levels and phases.
-
-        Args:
-            draws: Random draws.
-
-        Returns:
-            Scatterers of shape (..., count).
-        """
-        x, r = _in_rectangle(self, draws, "scene.random")
         share = draws.uniform("scene.random.level", (self.count,))
         level = 10 ** (-with_dims(self.spread_db, 1, share) * share / 20)
         phase = 2 * math.pi * draws.uniform("scene.random.phase", (self.count,))
-        return Scatterers(x, r, torch.polar(*torch.broadcast_tensors(level, phase)))
+        amplitude = torch.polar(*torch.broadcast_tensors(level, phase))
+        return Scatterers(*self._places(draws, "scene.random"), amplitude)
 
 
 @dataclass(frozen=True)
-class Speckle:
+class Speckle(_Rectangle):
     """Rectangle of fully developed speckle: circular Gaussian scatterers at random positions.
 
     About three scatterers or more per resolution cell are needed for the statistics of clutter.
@@ -188,47 +206,20 @@ class Speckle:
         ValueError: If there is no scatterer, an extent is negative or a number is out of range.
     """
 
-    count: int
-    azimuth_extent_m: Tensor | float
-    range_extent_m: Tensor | float
-    azimuth_m: Tensor | float = 0.0
-    range_m: Tensor | float = 0.0
     level_db: Tensor | float = 0.0
 
     def __post_init__(self) -> None:
-        _refuse_empty(self.count, self.azimuth_extent_m, self.range_extent_m)
-        for name in ("azimuth_m", "range_m"):
-            refuse_unless_finite(f"{name} of speckle", getattr(self, name))
+        super().__post_init__()
         refuse_unless("level_db must lie within +-300 dB", self.level_db, lambda x: abs(x) <= 300)
 
     def scatterers(self, draws: Draws) -> Scatterers:
-        """Draw positions and amplitudes.
-
-        Args:
-            draws: Random draws.
-
-        Returns:
-            Scatterers of shape (..., count).
-        """
-        x, r = _in_rectangle(self, draws, "scene.speckle")
         unit = draws.normal("scene.speckle.amplitude", (self.count,), torch.complex128)
         scale = 10 ** (with_dims(self.level_db, 1, unit) / 20) / math.sqrt(self.count)
-        return Scatterers(x, r, scale * unit)
-
-
-def _in_rectangle(scene: RandomPoints | Speckle, draws: Draws, purpose: str) -> tuple[Tensor, Tensor]:
-    """Random azimuth and range of scatterers in the rectangle of a scene, (..., target) each."""
-    shares = [draws.uniform(f"{purpose}.{name}", (scene.count,)) for name in ("azimuth", "range")]
-    middles, extents = (scene.azimuth_m, scene.range_m), (scene.azimuth_extent_m, scene.range_extent_m)
-    x, r = (
-        with_dims(middle, 1, share) + with_dims(extent, 1, share) * (share - 0.5)
-        for middle, extent, share in zip(middles, extents, shares, strict=True)
-    )
-    return x, r
+        return Scatterers(*self._places(draws, "scene.speckle"), scale * unit)
 
 
 @dataclass(frozen=True)
-class Together:
+class Together(Scene):
     """Several scenes in one.
 
     Args:
@@ -238,21 +229,21 @@ class Together:
     parts: Mapping[str, Scene]
 
     def scatterers(self, draws: Draws) -> Scatterers:
-        """Draw the scatterers of all parts, in their order.
+        parts = [scene.scatterers(draws.part(name)) for name, scene in self.parts.items()]
+        trials = np.broadcast_shapes(*(x.shape[:-1] for part in parts for x in part.tensors))
+        return Scatterers(*(joined(kind, trials) for kind in zip(*(part.tensors for part in parts), strict=True)))
 
-        Args:
-            draws: Random draws.
 
-        Returns:
-            Scatterers of shape (..., target).
-        """
-        all_parts = [scene.scatterers(draws.part(name)) for name, scene in self.parts.items()]
-        trials = np.broadcast_shapes(
-            *(p.amplitude.shape[:-1] for p in all_parts), *(p.azimuth_m.shape[:-1] for p in all_parts)
-        )  # parts without random numbers are equal in all trials
-        return Scatterers(
-            *(
-                torch.cat([getattr(p, field).expand(*trials, -1) for p in all_parts], -1)
-                for field in ("azimuth_m", "range_m", "amplitude")
-            )
-        )
+def joined(parts: Sequence[Tensor], trials: Sequence[int] = ()) -> Tensor:
+    """Join the targets of several scenes along the last dimension.
+
+    Args:
+        parts: A quantity in each scene, shape (..., target).
+        trials: Shape of the trials, to which quantities that are equal in all trials are expanded
+            even if no part differs between trials.
+
+    Returns:
+        The quantity in all scenes, shape (..., target).
+    """
+    trials = np.broadcast_shapes(tuple(trials), *(x.shape[:-1] for x in parts))
+    return torch.cat([x.expand(*trials, -1) for x in parts], -1)

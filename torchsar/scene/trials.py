@@ -10,15 +10,14 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Recording, per_trial
 
-# types that hold no parameters per trial
-_PLAIN = (float, int, str, type(None))
+_Class = TypeVar("_Class")
 
 
 def refuse_unless(sentence: str, value: Tensor | float, within: Callable[[Any], Any], advice: str = "") -> None:
@@ -71,6 +70,54 @@ def refuse_unless_finite(
         bound = "" if least == -math.inf else f" of {least:g} or more"
         sentence = f"{what} must be a finite number{bound}, or one per trial"
         refuse_unless(sentence, value, lambda x: finite(x) & (x >= least))  # type: ignore[arg-type]
+
+
+def refuse_unless_positive(what: str, value: Tensor | float | None) -> None:
+    """Raise ValueError unless every entry of a parameter is positive and finite.
+
+    Args:
+        what: Name of the parameter for the message.
+        value: Number, one value per trial of shape (...,), or None, which is accepted.
+
+    Raises:
+        ValueError: If an entry is not finite or not above 0.
+    """
+    if value is not None:
+        refuse_unless(f"{what} must be a positive number", value, positive)
+
+
+def finite_numbers(whose: str = "", **limits: float | str | None) -> Callable[[type[_Class]], type[_Class]]:
+    """Let a dataclass refuse numbers that are not finite. Write the decorator below `@dataclass`.
+
+    It examines all fields whose annotations name floats, before the `__post_init__` of the class.
+
+    Args:
+        whose: What the class describes, such as "a ship", for messages.
+        **limits: By name of a field, its smallest value, "positive" for a value above 0, or None
+            for a field that the class examines itself.
+
+    Returns:
+        The decorator of the class.
+    """
+
+    def decorated(cls: type[_Class]) -> type[_Class]:
+        own: Callable[[Any], None] | None = getattr(cls, "__post_init__", None)
+        names = [name for name, hint in cls.__annotations__.items() if "float" in hint]
+
+        def examine(self: Any) -> None:
+            for name in names:
+                what, value, limit = f"{name} of {whose}" if whose else name, getattr(self, name), limits.get(name, "")
+                if limit == "positive":
+                    refuse_unless_positive(what, value)
+                elif limit is not None:
+                    refuse_unless_finite(what, value, -math.inf if isinstance(limit, str) else limit)
+            if own is not None:
+                own(self)
+
+        setattr(cls, "__post_init__", examine)  # noqa: B010
+        return cls
+
+    return decorated
 
 
 def finite(x: Any) -> Any:
@@ -181,7 +228,7 @@ def refuse_other_trials(thing: object, draws: Draws, recording: Recording | None
         raise ValueError(f"parameters per trial must all have the same number of trials, got the shapes {found}")
 
 
-def repeated(thing: Any, times: int) -> Any:
+def repeated(thing: Any, times: int, behind: int = 0) -> Any:
     """Return an object whose parameters per trial hold each of their entries several times.
 
     Use the result where each trial of a world is simulated as several rows of a batch, such as one
@@ -189,57 +236,39 @@ def repeated(thing: Any, times: int) -> Any:
     the sequences, mappings and dataclasses that these hold.
 
     Args:
-        thing: Dataclass with parameters, or a sequence or mapping of such.
+        thing: Dataclass with parameters, a sequence or mapping of such, or a tensor.
         times: Number of rows of each trial.
+        behind: Number of the last dimensions of a tensor that are no trials.
 
     Returns:
         A copy of the object in which each per-trial tensor of shape (trial, ...) has become one of
         shape (trial * times, ...); the rows of a trial follow each other. If there is no per-trial
         tensor, the object itself.
     """
+    if isinstance(thing, Tensor):
+        return thing.repeat_interleave(times, 0) if thing.ndim > behind else thing
     if not any(shape for _, shape in _per_trial_shapes(thing)):
         return thing
     if isinstance(thing, Mapping):
         return {name: repeated(part, times) for name, part in thing.items()}
     if isinstance(thing, list | tuple):
         return type(thing)(repeated(part, times) for part in thing)
-    held = {name: (getattr(thing, name, None), behind) for name, behind in _parameters(type(thing))}
-    return replace(thing, **{name: _repeated(value, times, behind) for name, (value, behind) in held.items()})
+    held = {name: (getattr(thing, name), behind) for name, behind in _parameters(type(thing))}
+    return replace(thing, **{name: repeated(value, times, behind) for name, (value, behind) in held.items()})
 
 
-def _repeated(value: Any, times: int, behind: int) -> Any:
-    """A field with its entries repeated; the last `behind` dimensions of a tensor are no trials."""
-    if isinstance(value, Tensor):
-        return value.repeat_interleave(times, 0) if value.ndim > behind else value
-    if isinstance(value, list | tuple):
-        return type(value)(_repeated(entry, times, 0) for entry in value)
-    return repeated(value, times)
-
-
-def _per_trial_shapes(thing: object) -> Iterator[tuple[str, torch.Size]]:
-    """Names and trial dimensions of the per-trial parameters of an object and of its parts."""
-    if isinstance(thing, Mapping):
-        thing = list(thing.values())
-    if isinstance(thing, list | tuple):
-        for part in thing:
-            yield from _per_trial_shapes(part)
-    elif is_dataclass(thing) and not isinstance(thing, type):
-        for field, behind in _parameters(type(thing)):
-            value = getattr(thing, field, None)
-            if not isinstance(value, _PLAIN):
-                yield from _shapes_of(f"{field} of {type(thing).__name__}", value, behind)
-
-
-def _shapes_of(name: str, value: object, behind: int) -> Iterator[tuple[str, torch.Size]]:
-    """Name and trial dimensions of each tensor in a field; `behind` dimensions are no trials."""
+def _per_trial_shapes(value: object, name: str = "", behind: int = 0) -> Iterator[tuple[str, torch.Size]]:
+    """Names and trial dimensions of the per-trial parameters of an object and of its parts; the
+    last `behind` dimensions of a tensor are no trials.
+    """
     if isinstance(value, Tensor):
         yield name, value.shape[: max(0, value.ndim - behind)]
-    elif isinstance(value, list | tuple):
-        for entry in value:
-            if not isinstance(entry, _PLAIN):
-                yield from _shapes_of(name, entry, 0)
-    else:
-        yield from _per_trial_shapes(value)
+    elif isinstance(value, list | tuple | Mapping):
+        for part in value.values() if isinstance(value, Mapping) else value:
+            yield from _per_trial_shapes(part, name)
+    elif is_dataclass(value) and not isinstance(value, type):
+        for field, dims in _parameters(type(value)):
+            yield from _per_trial_shapes(getattr(value, field), f"{field} of {type(value).__name__}", dims)
 
 
 @cache

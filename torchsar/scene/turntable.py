@@ -12,11 +12,8 @@ from torch import Tensor
 from torchsar.radar import InverseRadar
 from torchsar.scene.rotation import PolynomialRotation
 from torchsar.scene.targets import Scene
-from torchsar.scene.trials import refuse_unless_finite
+from torchsar.scene.trials import finite_numbers
 from torchsar.scene.vibration import Motion, PulsePhase, displacement_m
-
-# samples along pulses and inside them on which neglected phases are evaluated
-_GRID = 65
 
 
 @dataclass(frozen=True)
@@ -69,7 +66,7 @@ class PhaseOnly:
             ValueError: If the pulse length or the rotation rate is not known.
         """
         theta, omega = _swing(radar, n_pulse, rotation_rad_s)
-        half_s, per_m = _pulse_s(radar) / 2, 4 * math.pi / radar.wave_speed_m_s
+        half_s, per_m = pulse_length_s(radar) / 2, 4 * math.pi / radar.wave_speed_m_s
         lever = abs(range_m + centre_deviation_m)
         migration = abs(cross_range_m) * math.sin(theta) + lever * (1 - math.cos(theta))
         inside = (omega * (abs(cross_range_m) + lever * theta) + abs(speed_m_s)) * half_s
@@ -97,8 +94,8 @@ class PhaseOnly:
         Returns:
             Error in dB.
         """
-        pulse = torch.linspace(0, n_pulse - 1, min(n_pulse, _GRID), dtype=torch.float64)[:, None]
-        inside = torch.linspace(-0.5, 0.5, _GRID, dtype=torch.float64) * _pulse_s(radar)
+        pulse = torch.linspace(0, n_pulse - 1, min(n_pulse, 65), dtype=torch.float64)[:, None]
+        inside = torch.linspace(-0.5, 0.5, 65, dtype=torch.float64) * pulse_length_s(radar)
         track = world.fidelity.track if isinstance(world.fidelity, Dechirped) else ()
         lever_m = range_m + float(torch.as_tensor(world.centre_deviation_m).reshape(-1)[0])
 
@@ -180,10 +177,7 @@ class Dechirped:
             )
         theta, _ = _swing(radar, n_pulse, rotation_rad_s)
         lever = abs(range_m + centre_deviation_m)
-        across = (
-            cross_range_m * math.cos(theta) + lever * math.sin(theta),
-            cross_range_m * math.cos(theta) - lever * math.sin(theta),
-        )
+        across = [cross_range_m * math.cos(theta) + side * lever * math.sin(theta) for side in (1, -1)]
         sag = max(abs(w * w - cross_range_m**2) for w in across) / (2 * radar.reference_range_m)
         return 4 * math.pi / radar.wavelength_m * sag
 
@@ -192,6 +186,7 @@ Fidelity = PhaseOnly | Dechirped
 
 
 @dataclass(frozen=True)
+@finite_numbers()
 class TurntableWorld:
     """Scene that rotates while it moves along the line of sight.
 
@@ -227,8 +222,6 @@ class TurntableWorld:
     centre_deviation_m: Tensor | float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("rotation_rad_s", "snr_db", "centre_deviation_m"):
-            refuse_unless_finite(name, getattr(self, name))
         if not isinstance(self.fidelity, PhaseOnly | Dechirped):
             raise TypeError(f"fidelity must be PhaseOnly() or Dechirped(), got {self.fidelity!r}")
         if not isinstance(self.rotation, PolynomialRotation | None):
@@ -254,8 +247,18 @@ def _swing(radar: InverseRadar, n_pulse: int, rotation: float | PolynomialRotati
     return abs(rate) * n_pulse / (2 * radar.prf_hz), abs(rate)
 
 
-def _pulse_s(radar: InverseRadar) -> float:
-    """Pulse length in seconds."""
+def pulse_length_s(radar: InverseRadar) -> float:
+    """Return the length of a dechirped pulse.
+
+    Args:
+        radar: Radar parameters.
+
+    Returns:
+        Length in seconds.
+
+    Raises:
+        ValueError: If it is not set.
+    """
     if radar.pulse_s is None:
-        raise ValueError("radar.pulse_s is not set; give the pulse length (s), on which phases within a pulse depend")
+        raise ValueError("radar.pulse_s is not set; give the pulse length (s), which dechirped pulses need")
     return radar.pulse_s

@@ -17,13 +17,10 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, per_trial
-from torchsar.scene.trials import refuse_unless_finite
+from torchsar.scene.trials import finite_numbers, refuse_unless_finite
 
-# metres of the units in which vibrations are published
-_UNIT_M = {"mm": 1e-3, "um": 1e-6}
 # amplitude_frequency_phase, such as 1_0.1_90
-_NUMBER = r"(\d+(?:\.\d+)?)"
-_NAME = re.compile(rf"{_NUMBER}_{_NUMBER}_(-?\d+(?:\.\d+)?)")
+_NAME = re.compile(r"(\d+(?:\.\d+)?)_(\d+(?:\.\d+)?)_(-?\d+(?:\.\d+)?)")
 
 
 class Motion(Protocol):
@@ -42,7 +39,8 @@ class Motion(Protocol):
 
 
 @dataclass(frozen=True)
-class Sinusoid:
+@finite_numbers("a vibration", frequency_hz=0.0)
+class Sinusoid(Motion):
     """Sinusoidal vibration, d(t) = A sin(2 pi f t + phase).
 
     This SINE reproduces the results of the Reference. With a cosine, the vibration `1_0.1_90` of
@@ -65,11 +63,6 @@ class Sinusoid:
     frequency_hz: Tensor | float
     phase_deg: Tensor | float = 0.0
 
-    def __post_init__(self) -> None:
-        refuse_unless_finite("amplitude_m of a vibration", self.amplitude_m)
-        refuse_unless_finite("frequency_hz of a vibration", self.frequency_hz, 0.0)
-        refuse_unless_finite("phase_deg of a vibration", self.phase_deg)
-
     @classmethod
     def named(cls, name: str, *, unit: Literal["mm", "um"]) -> Sinusoid:
         """Return the sinusoidal vibration of a name amplitude_frequency_phase, such as `1_0.1_90`.
@@ -89,7 +82,8 @@ class Sinusoid:
         Reference:
             Ruan et al. 2013, Table 1.
         """
-        if unit not in _UNIT_M:
+        metres = {"mm": 1e-3, "um": 1e-6}
+        if unit not in metres:
             raise ValueError(f"unit {unit!r} of a vibration's amplitude is unknown; choose 'mm' or 'um'")
         found = _NAME.fullmatch(name) if isinstance(name, str) else None
         if found is None:
@@ -98,17 +92,9 @@ class Sinusoid:
                 "in Hz, phase in degrees), such as '1_100_90' or '1_0.1_90'"
             )
         amplitude, frequency, phase = (float(part) for part in found.groups())
-        return cls(amplitude * _UNIT_M[unit], frequency, phase)
+        return cls(amplitude * metres[unit], frequency, phase)
 
     def displacement_m(self, time_s: Tensor) -> Tensor:
-        """Return the displacement; its phase is reduced to one cycle, and stays exact over hours.
-
-        Args:
-            time_s: Time since the first pulse in seconds, any shape, float64.
-
-        Returns:
-            Displacement in metres, receding positive, shape (*trials, *times).
-        """
         amplitude, frequency, phase = (
             per_trial(v, time_s.ndim, time_s) for v in (self.amplitude_m, self.frequency_hz, self.phase_deg)
         )
@@ -117,7 +103,7 @@ class Sinusoid:
 
 
 @dataclass(frozen=True)
-class Polynomial:
+class Polynomial(Motion):
     """Translation d(t) = c1 t + c2 t^2 + ...
 
     There is no constant term: the range window is centred on the initial position.
@@ -142,14 +128,6 @@ class Polynomial:
             refuse_unless_finite(f"coefficient {degree} of a translation", value)
 
     def displacement_m(self, time_s: Tensor) -> Tensor:
-        """Return the displacement.
-
-        Args:
-            time_s: Time since the first pulse in seconds, any shape, float64.
-
-        Returns:
-            Displacement in metres, receding positive, shape (*trials, *times).
-        """
         total = torch.zeros_like(time_s)
         for value in reversed(self.coefficients_m):
             total = (total + per_trial(value, time_s.ndim, time_s)) * time_s
@@ -166,10 +144,7 @@ def displacement_m(motion: Sequence[Motion], time_s: Tensor) -> Tensor:
     Returns:
         Displacement in metres, receding positive, shape (*trials, *times).
     """
-    total = torch.zeros_like(time_s)
-    for part in motion:
-        total = total + part.displacement_m(time_s)
-    return total
+    return sum((part.displacement_m(time_s) for part in motion), torch.zeros_like(time_s))
 
 
 class PulsePhase(Protocol):
@@ -189,7 +164,8 @@ class PulsePhase(Protocol):
 
 
 @dataclass(frozen=True)
-class StartPhase:
+@finite_numbers("a start phase", sigma_rad=0.0)
+class StartPhase(PulsePhase):
     """Independent normally distributed phase of each pulse.
 
     Args:
@@ -201,37 +177,16 @@ class StartPhase:
 
     sigma_rad: Tensor | float
 
-    def __post_init__(self) -> None:
-        refuse_unless_finite("sigma_rad of a start phase", self.sigma_rad, 0.0)
-
     def phase_rad(self, draws: Draws, n_pulse: int) -> Tensor:
-        """Draw the phases.
-
-        Args:
-            draws: Random draws.
-            n_pulse: Number of pulses.
-
-        Returns:
-            Phase in radians, shape (*trials, pulse), float64.
-        """
         unit = draws.normal("scene.start_phase.normal", (n_pulse,))
         return per_trial(self.sigma_rad, 1, unit) * unit
 
 
 @dataclass(frozen=True)
-class UniformStartPhase:
+class UniformStartPhase(PulsePhase):
     """Independent phase of each pulse, uniform in 0 to 2 pi: pulses are incoherent."""
 
     def phase_rad(self, draws: Draws, n_pulse: int) -> Tensor:
-        """Draw the phases.
-
-        Args:
-            draws: Random draws.
-            n_pulse: Number of pulses.
-
-        Returns:
-            Phase in radians, shape (*trials, pulse), float64.
-        """
         return draws.uniform("scene.start_phase.uniform", (n_pulse,), 0.0, 2 * math.pi)
 
 
@@ -247,7 +202,5 @@ def start_phase_rad(effects: Sequence[PulsePhase], draws: Draws, n_pulse: int) -
     Returns:
         Phase in radians, shape (*trials, pulse), float64.
     """
-    total = torch.zeros(n_pulse, dtype=torch.float64)
-    for position, effect in enumerate(effects):
-        total = total + effect.phase_rad(draws.part(f"start_phase.{position}"), n_pulse)
-    return total
+    drawn = (effect.phase_rad(draws.part(f"start_phase.{at}"), n_pulse) for at, effect in enumerate(effects))
+    return sum(drawn, torch.zeros(n_pulse, dtype=torch.float64))

@@ -31,7 +31,8 @@ from torchsar.multichannel.reconstruct import Rebuild
 from torchsar.multichannel.velocity.sir import Intensity, signal_intensity
 from torchsar.reproduce.geo.sensor import BANDWIDTH_HZ, INTEGRATION_S, RADAR
 from torchsar.reproduce.item import Check, Item, falling, number, statement
-from torchsar.scene import BandLimited, BistaticWorld, Gate, MovingPoints, Pattern
+from torchsar.scene import BandLimited, BistaticWorld, MovingPoints, Pattern
+from torchsar.scene.bistatic import Gate
 
 # length of a record (s) that holds all replicas
 RECORD_S = 20.0

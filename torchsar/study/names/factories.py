@@ -10,16 +10,17 @@ from collections.abc import Callable, Sequence
 from functools import wraps
 from typing import Any, Literal
 
+import torch
 from torch import Tensor
 
 from torchsar.compensate import Autofocus, EffectiveVelocity, RotationAutofocus, UnevenRotation
 from torchsar.compensate.pulse_phase import CorrectPulsePhase
 from torchsar.core import Alternate, Turn
-from torchsar.echo import PolynomialDrift, SinusoidDrift, SynchronisationError, WalkDrift
 from torchsar.focus import OmegaK, PaddedLines, TargetImage
+from torchsar.io.plain import read_array, read_track
 from torchsar.radar import LIGHT_M_S, FarField, InverseRadar, Spotlight, StripmapRadar
 from torchsar.repair import BandLimited, CorrectJitter, Lagrange
-from torchsar.scene import Dechirped, ImageReflectivity, KSea, Polynomial
+from torchsar.scene import Dechirped, ImageReflectivity, KSea, MeasuredTrack, Polynomial
 
 
 def effective_velocity(
@@ -181,6 +182,21 @@ def k_sea(
     return KSea(power_db=cnr_db, shape=shape, cell_m=cell_m, margin_s=margin_s, lobes=lobes)
 
 
+def measured_track(file: str) -> MeasuredTrack:
+    """Measured displacement at equally spaced times, interpolated by a cubic spline.
+
+    Args:
+        file: Text or .csv file of two columns, times in seconds and displacements in metres
+            (separated by commas or blanks, a line of names is allowed), .npy file of shape (n, 2),
+            or .npz file with `time_s` (n,) and `displacement_m` (..., n).
+    """
+    time_s, displacement_m = (torch.as_tensor(x, dtype=torch.float64) for x in read_track(file))
+    try:
+        return MeasuredTrack(time_s, displacement_m)
+    except ValueError as problem:
+        raise ValueError(f"{file}: {problem}") from None
+
+
 def image_sea(
     file: str,
     azimuth_extent_m: Tensor | float,
@@ -204,47 +220,10 @@ def image_sea(
             the antenna illuminates the surface.
     """
     try:
-        return ImageReflectivity.from_file(
-            file, azimuth_extent_m, range_extent_m, key, power_db=cnr_db, margin_s=margin_s, lobes=lobes
-        )
+        keys = {"power_db": cnr_db, "margin_s": margin_s, "lobes": lobes}
+        return ImageReflectivity(read_array(file, key), azimuth_extent_m, range_extent_m, **keys)
     except OSError as error:
         raise ValueError(f"the image {file!r} cannot be read: {error.strerror or error}") from None
-
-
-def clock_errors(
-    phase_rad: Sequence[Tensor | float] | None = None,
-    phase_sinusoid_rad: Tensor | float = 0.0,
-    phase_walk_rad: Tensor | float = 0.0,
-    delay_s: Sequence[Tensor | float] | None = None,
-    delay_sinusoid_s: Tensor | float = 0.0,
-    sinusoid_hz: Tensor | float = 0.5,
-    direct_snr_db: Tensor | float | None = 40.0,
-    direct_samples: int = 64,
-) -> SynchronisationError:
-    """Phase and delay errors of clocks that drift apart: polynomials of slow time, sinusoids and a
-    random walk from pulse to pulse. The direct signal of the transmitter, which has the same
-    errors, is recorded as well.
-
-    Args:
-        phase_rad: Polynomial of the phase in rad, rad/s, ...
-        phase_sinusoid_rad: Amplitude of a sinusoidal phase in radians.
-        phase_walk_rad: Standard deviation of the steps of a random walk in radians.
-        delay_s: Polynomial of the delay in s, s/s, ...
-        delay_sinusoid_s: Amplitude of a sinusoidal delay in seconds.
-        sinusoid_hz: Frequency of the sinusoids in Hz.
-        direct_snr_db: Peak signal-to-noise ratio of the direct signal in dB; None for no noise.
-        direct_samples: Number of range samples of the direct signal in each pulse.
-    """
-    phase = [
-        PolynomialDrift(phase_rad or [0.0]),
-        SinusoidDrift(phase_sinusoid_rad, sinusoid_hz),
-        WalkDrift(phase_walk_rad),
-    ]
-    delay = [PolynomialDrift(delay_s or [0.0]), SinusoidDrift(delay_sinusoid_s, sinusoid_hz)]
-    # azimuth-only data have no range cells and admit no delay; the phase terms keep their random
-    # number addresses either way
-    delayed = bool(delay_s) or isinstance(delay_sinusoid_s, Tensor) or bool(delay_sinusoid_s)
-    return SynchronisationError(phase, delay if delayed else [], direct_snr_db, direct_samples)
 
 
 def with_wavelength(radar: type) -> Callable[..., Any]:

@@ -12,6 +12,7 @@ from importlib.metadata import entry_points
 from typing import Annotated, Any
 
 from torchsar import compensate, echo, focus, multichannel, repair, scene
+from torchsar.scene.fluctuation import RandomMotion
 from torchsar.study.names import channels, factories
 from torchsar.study.settings.errors import loading
 from torchsar.study.settings.signature import Catalogue, Section
@@ -43,7 +44,7 @@ RADIAL_MOTIONS = Catalogue(
         "drift": factories.drift,
         "path_fluctuation": scene.PathFluctuation,
         "vibration_spectrum": scene.VibrationSpectrum,
-        "measured_track": scene.MeasuredTrack.from_file,
+        "measured_track": factories.measured_track,
     },
 )
 FLIGHT_MOTIONS = Catalogue(
@@ -77,7 +78,7 @@ RECEIVE_RANGES = Catalogue("receive range", "kind", {"exact": scene.ExactRange, 
 MULTICHANNEL_IMPAIRMENTS = Catalogue(
     "impairment of a multichannel recording",
     "kind",
-    {"channel_errors": echo.ChannelErrors, "clock_errors": factories.clock_errors},
+    {"channel_errors": echo.ChannelErrors, "clock_errors": echo.SynchronisationError},
 )
 IMPAIRMENTS = Catalogue(
     "impairment",
@@ -108,7 +109,7 @@ TARGET_IMPAIRMENTS = Catalogue(
         for name in ("lost_pulses", "white_phase", "phase_walk", "phase_sinusoid", "quantiser")
     },
 )
-AntennaMotions = Sequence[Annotated[scene.Motion | scene.RandomMotion, FLIGHT_MOTIONS]]
+AntennaMotions = Sequence[Annotated[scene.Motion | RandomMotion, FLIGHT_MOTIONS]]
 
 
 def path_error(x: AntennaMotions = (), y: AntennaMotions = (), z: AntennaMotions = ()) -> echo.PathError:

@@ -31,19 +31,9 @@ from torchsar.metrics import (
     residual_phase,
 )
 from torchsar.radar import AntennaPath, InverseRadar
-from torchsar.scene import (
-    Flight,
-    Navigation,
-    NominalPath,
-    PathWorld,
-    PlaneGround,
-    Points,
-    Scene,
-    SideBeam,
-    Sway,
-    Together,
-)
-from torchsar.scene.path_world import Ground
+from torchsar.scene import Flight, Navigation, PathWorld, PlaneGround, Points, Scene, SideBeam, Sway, Together
+from torchsar.scene.flight import NominalPath
+from torchsar.scene.path import Ground
 from torchsar.study.names.registry import GROUNDS, NOMINAL_PATHS, PATH_IMPAIRMENTS, SCENES, AntennaMotions
 from torchsar.study.output.pictures import Drawn, first_named
 from torchsar.study.systems.isal import estimated_phase, received

@@ -41,7 +41,8 @@ from torchsar.multichannel import (
 from torchsar.multichannel.azimuth import known_motion_chain
 from torchsar.multichannel.requirements import Estimator
 from torchsar.multichannel.velocity.walk import MigratingLines
-from torchsar.scene import BandLimited, ExactRange, LitPoints, MovingPoints, TaylorRange
+from torchsar.scene import BandLimited, ExactRange, MovingPoints, TaylorRange
+from torchsar.scene.lit_points import LitPoints
 from torchsar.study.systems.geo.judge import FocusedPoint, PeakCuts, point_responses, worst_image_error_db
 from torchsar.study.systems.geo.world import TRUTHS, Level, Points
 from torchsar.study.trials.batch import Trials

@@ -11,10 +11,12 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Recording, Truth, unit_phasor
-from torchsar.echo import Impairment, apply_impairments, sea_echo, simulate_bistatic
+from torchsar.echo import Impairment, apply_impairments, simulate_bistatic
+from torchsar.echo.sea import sea_echo
 from torchsar.radar import LIGHT_M_S, BistaticRadar, Ephemeris, LinearFM
-from torchsar.scene import BandLimited, BistaticWorld, ExactRange, Gate, MovingPoints, PolynomialTransmit, Sea
-from torchsar.scene.moving import ReceiveRange
+from torchsar.scene import BandLimited, BistaticWorld, ExactRange, MovingPoints, PolynomialTransmit
+from torchsar.scene.bistatic import Gate, ReceiveRange
+from torchsar.scene.sea import Sea
 from torchsar.scene.trials import repeated
 from torchsar.study.names.registry import GATES, MULTICHANNEL_IMPAIRMENTS, RECEIVE_RANGES, SEAS
 from torchsar.study.trials.batch import Trials

@@ -19,8 +19,11 @@ from torchsar.multichannel import Extraction, PointMotion, RemoveTransmitRange, 
 from torchsar.multichannel.reconstruct import LeastSquares, Rebuild, condition_number, noise_gain_db
 from torchsar.multichannel.scene_image import MoversImage
 from torchsar.radar import BistaticRadar
-from torchsar.scene import BandLimited, BistaticWorld, Fleet, Gate, KSea, Movers, Sea
+from torchsar.scene import BandLimited, BistaticWorld, Fleet, KSea
 from torchsar.scene import Ship as ShipOfPoints
+from torchsar.scene.bistatic import Gate
+from torchsar.scene.movers import Movers
+from torchsar.scene.sea import Sea
 from torchsar.study.names.registry import GATES, SEAS
 from torchsar.study.output.pictures import Drawn, comparisons
 from torchsar.study.settings.errors import ConfigError

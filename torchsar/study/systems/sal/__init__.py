@@ -26,7 +26,6 @@ from torchsar.metrics import (
 from torchsar.radar import TriangularLadar
 from torchsar.scene import (
     CalibrationFibre,
-    Fidelity,
     LadarWorld,
     LinearInSweep,
     LogAmplitude,
@@ -37,6 +36,7 @@ from torchsar.scene import (
     Together,
 )
 from torchsar.scene.ladar import SweepError
+from torchsar.scene.ladar_range import Fidelity
 from torchsar.study.names.factories import with_wavelength
 from torchsar.study.names.registry import (
     CALIBRATIONS,

@@ -14,12 +14,12 @@ from torch import Tensor
 from torchsar.compensate.radial import mirror_product, radial_motion, segmented_interference, spectrum_correlation
 from torchsar.compensate.radial.measured import Intercept
 from torchsar.core import Draws, Estimate
-from torchsar.echo import range_model_error_db
+from torchsar.echo.ladar import range_model_error_db
 from torchsar.focus import AzimuthMatchedFilter
 from torchsar.focus.ladar_requirements import ladar_limits, ladar_requirements
 from torchsar.focus.requirements import Limit, Requirement
 from torchsar.metrics import error_after_gain_db
-from torchsar.scene import drawn_motion
+from torchsar.scene.fluctuation import drawn_motion
 from torchsar.scene.moved_scene import Moved
 from torchsar.study.names.registry import SWEEP_FIDELITIES
 from torchsar.study.systems.sal.judge import lit_periods

@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Chain, Draws, Signal, Trace, Truth, wrapped
-from torchsar.echo import Impairment, apply_impairments, simulate, target_energy
+from torchsar.echo import Impairment, apply_impairments, simulate
+from torchsar.echo.strip import target_energy
 from torchsar.focus import ClosestRange
 from torchsar.focus.requirements import Limit, Requirement, strip_limits
 from torchsar.focus.skew import common_lines
@@ -20,7 +21,8 @@ from torchsar.io import read_stripmap
 from torchsar.metrics import contrast, correlation, entropy, error_db, impulse_response
 from torchsar.metrics.bounds import reference_doppler_std_hz, tone_frequency_bound_hz, velocity_bound_m_s
 from torchsar.radar import StripmapRadar
-from torchsar.scene import AlwaysLit, Beam, Hyperbola, Path, Points, RandomPoints, Scene, StripmapWorld, Together
+from torchsar.scene import AlwaysLit, Hyperbola, Points, RandomPoints, Scene, StripmapWorld, Together
+from torchsar.scene.strip import Beam, Path
 from torchsar.study.names.factories import with_wavelength
 from torchsar.study.names.registry import BEAMS, IMPAIRMENTS, PATHS, SCENES
 from torchsar.study.output.pictures import Drawn, comparisons

@@ -1,34 +1,24 @@
-"""Simulation of stripmap acquisitions, and the application of impairments."""
+"""Simulation of strips."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
-from typing import Protocol
+from collections.abc import Mapping
+from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import Draws, Recording, Signal, Truth, gathered_checks, per_trial, power_of
-from torchsar.echo.pulsed import echo_spectrum
+from torchsar.core import Draws, Recording, Truth, gathered_checks, per_trial, power_of
+from torchsar.core.fft import smooth_length
+from torchsar.echo.recorded import Impairment, noise, recorded
+from torchsar.echo.sums import blocks, echo_spectrum
 from torchsar.radar import StripmapRadar
 from torchsar.scene import Scatterers, StripmapWorld
 from torchsar.scene.trials import refuse_other_trials
 
 # phase tables of a block of pulses and targets, about the cache of a processor
 _TABLE_BYTES = 8 << 20
-
-
-class Impairment(Protocol):
-    """Impairment of a recording by the receiver or the environment.
-
-    It is called with a recording and random draws, and returns the impaired recording and the true
-    values of the impairment by name.
-    """
-
-    def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, Mapping[str, Tensor]]: ...
 
 
 @dataclass(frozen=True)
@@ -132,11 +122,9 @@ def _lines(
     """Raw lines (..., pulse, range) by FFTs of n_fft samples."""
     spectrum = torch.fft.fftshift(radar.pulse.spectrum(n_fft, radar.sampling_hz, placed.closest_m.device)).to(dtype)
     lines = []
-    for pulses in _pulse_blocks(placed, n_pulse, n_fft):
-        pulse_s = (
-            torch.arange(pulses.start, pulses.stop, dtype=torch.float64, device=placed.closest_m.device) / radar.prf_hz
-        )
-        block = _block_spectrum(placed, world, radar, pulse_s, n_fft, dtype)
+    slow_s = torch.arange(n_pulse, dtype=torch.float64, device=placed.closest_m.device) / radar.prf_hz
+    for pulses in blocks(n_pulse, 8 * n_fft, _TABLE_BYTES, 64):
+        block = _block_spectrum(placed, world, radar, slow_s[pulses], n_fft, dtype)
         lines.append(torch.fft.ifft(torch.fft.ifftshift(block * spectrum, dim=-1))[..., :n_range])
     return torch.cat(lines, -2)
 
@@ -148,12 +136,13 @@ def _block_spectrum(
     velocity = per_trial(radar.velocity_m_s if world.velocity_m_s is None else world.velocity_m_s, 2, pulse_s)
     doppler = per_trial(_true_doppler(world, radar), 2, pulse_s)
     total = torch.zeros((*placed.closest_m.shape[:-1], pulse_s.numel(), n_fft), dtype=dtype, device=pulse_s.device)
-    blocks = list(_target_blocks(placed, pulse_s.numel(), n_fft))
-    for targets in blocks:
+    count = placed.closest_m.shape[-1]
+    width = max(16, _TABLE_BYTES // (8 * pulse_s.numel() * 3 * math.isqrt(n_fft)))
+    for targets in (slice(first, first + width) for first in range(0, count, width)):
         since, closest, weight = _times_and_gain(placed, targets, world, radar, pulse_s, doppler, velocity)
-        lit = (
-            slice(None) if len(blocks) == 1 else _lit(weight)
-        )  # all of few targets, so that the sum of a trial does not depend on other trials
+        # all of few targets, so that the sum of a trial does not depend on other trials; else those
+        # that any pulse of any trial illuminates
+        lit = slice(None) if count <= width else (weight.detach() != 0).flatten(0, -2).any(0).nonzero()[:, 0]
         since, closest, weight = (x[..., lit] for x in (since, closest, weight))
         if not since.shape[-1]:
             continue
@@ -161,14 +150,8 @@ def _block_spectrum(
         delay = 2 * (range_m - radar.near_range_m) / radar.wave_speed_m_s
         inside = (delay > -radar.pulse.duration_s) & (delay < n_fft / radar.sampling_hz)
         amplitude = placed.amplitude[..., None, targets][..., lit] * torch.where(inside, weight, 0)
-        total = total + echo_spectrum(
-            delay,
-            2 * radar.carrier_hz / radar.wave_speed_m_s * range_m,
-            amplitude,
-            n_fft,
-            radar.sampling_hz / n_fft,
-            dtype,
-        )
+        turns = 2 * radar.carrier_hz / radar.wave_speed_m_s * range_m
+        total = total + echo_spectrum(delay, turns, amplitude, n_fft, radar.sampling_hz / n_fft, dtype)
     return total
 
 
@@ -186,24 +169,14 @@ def _times_and_gain(
         x[..., None, targets] for x in (placed.crossing_s, placed.zero_doppler_s, placed.closest_m)
     )
     since = pulse_s[:, None] - zero
-    offset = (
-        2
-        * velocity_m_s.square()
-        * -since
-        / (radar.wavelength_m * torch.sqrt(closest.square() + (velocity_m_s * since).square()))
-        - doppler_hz
-    )
+    range_m = torch.sqrt(closest.square() + (velocity_m_s * since).square())
+    offset = 2 * velocity_m_s.square() * -since / (radar.wavelength_m * range_m) - doppler_hz
     return torch.broadcast_tensors(since, closest, world.beam.weight(pulse_s[:, None] - crossing, offset, velocity_m_s))
 
 
 def _true_doppler(world: StripmapWorld, radar: StripmapRadar) -> Tensor | float:
     """Doppler frequency of the beam centre of the world, by default that of the radar."""
     return (radar.pointing_doppler_hz or 0.0) if world.doppler_hz is None else world.doppler_hz
-
-
-def _lit(weight: Tensor) -> Tensor:
-    """Indices of the targets that any pulse of any trial illuminates."""
-    return (weight.detach() != 0).flatten(0, -2).any(0).nonzero()[:, 0]
 
 
 def _line_length(placed: Placed, radar: StripmapRadar, n_range: int) -> int:
@@ -214,8 +187,7 @@ def _line_length(placed: Placed, radar: StripmapRadar, n_range: int) -> int:
     )
     if first >= 0 and last + _margin(radar) <= n_range:
         return n_range
-    need = n_range + radar.pulse_samples
-    return next(n for n in range(need, 2 * need) if _smooth(n))
+    return smooth_length(n_range + radar.pulse_samples)
 
 
 def _fits(placed: Placed, radar: StripmapRadar, n_range: int) -> Tensor:
@@ -228,28 +200,6 @@ def _fits(placed: Placed, radar: StripmapRadar, n_range: int) -> Tensor:
 def _margin(radar: StripmapRadar) -> int:
     """Samples of a pulse and, by choice, 256 samples of range migration."""
     return 256 + radar.pulse_samples
-
-
-def _smooth(n: int) -> bool:
-    """Whether a number has no prime factor above 5."""
-    for p in (2, 3, 5):
-        while n % p == 0:
-            n //= p
-    return n == 1
-
-
-def _pulse_blocks(placed: Placed, n_pulse: int, n_fft: int) -> Iterator[slice]:
-    """Blocks of pulses, independent of the number of trials, so that sums round equally."""
-    height = max(1, min(64, _TABLE_BYTES // (8 * n_fft)))
-    for first in range(0, n_pulse, height):
-        yield slice(first, min(first + height, n_pulse))
-
-
-def _target_blocks(placed: Placed, height: int, n_fft: int) -> Iterator[slice]:
-    """Blocks of targets whose tables fit the cache."""
-    width = max(16, _TABLE_BYTES // (8 * height * 3 * math.isqrt(n_fft)))
-    for first in range(0, placed.closest_m.shape[-1], width):
-        yield slice(first, min(first + width, placed.closest_m.shape[-1]))
 
 
 def target_energy(truth: Truth, world: StripmapWorld, radar: StripmapRadar, n_pulse: int) -> Tensor:
@@ -335,9 +285,8 @@ def simulate(
     refuse_other_trials(world, draws)
     velocity = radar.velocity_m_s if world.velocity_m_s is None else world.velocity_m_s
     doppler = _true_doppler(world, radar)
-    scatterers = world.scene.scatterers(draws)
-    scatterers = Scatterers(*(x.to(device) for x in (scatterers.azimuth_m, scatterers.range_m, scatterers.amplitude)))
-    _refuse_impossible(scatterers, radar, n_range, radar.sin_squint(doppler, velocity))
+    scatterers = world.scene.scatterers(draws).to(device)
+    _refuse_impossible(radar, n_range, radar.sin_squint(doppler, velocity))
     placed = path_geometry(scatterers, radar, n_pulse, n_range, doppler, velocity)
     if bool((placed.closest_m <= 0).any()):
         raise ValueError(
@@ -348,12 +297,7 @@ def simulate(
     std = torch.zeros((), dtype=torch.float64, device=device)
     if world.snr_db is not None:
         std = torch.sqrt(lit_power(echo.detach()).double() / 10 ** (per_trial(world.snr_db, 0, echo) / 10))
-        noise = draws.normal("noise", (n_pulse, n_range), dtype, device)
-        echo = echo + noise * std.to(echo.real.dtype)[..., None, None]
-    trials = () if draws.trials is None else (len(draws.trials),)
-    # without random numbers the echo has no trials yet
-    echo = echo.expand(*np.broadcast_shapes(echo.shape[:-2], trials), -1, -1)
-    clean = Recording(Signal(echo, radar.raw_axes(n_pulse, n_range)), radar)
+        echo = echo + noise(draws, "noise", (n_pulse, n_range), std, dtype, device)
     values = {
         "crossing_s": placed.crossing_s,
         "zero_doppler_s": placed.zero_doppler_s,
@@ -363,14 +307,11 @@ def simulate(
         "doppler_hz": torch.as_tensor(doppler, dtype=torch.float64),
         "noise_std": std,
     }
-    recording, true_values = apply_impairments(clean, impairments or {}, draws)
-    return recording, Truth({**values, **true_values}, clean)
+    return recorded(echo, echo, radar.raw_axes(n_pulse, n_range), radar, values, impairments, draws)
 
 
-def _refuse_impossible(scatterers: Scatterers, radar: StripmapRadar, n_range: int, sin_squint: Tensor) -> None:
+def _refuse_impossible(radar: StripmapRadar, n_range: int, sin_squint: Tensor) -> None:
     """Raise ValueError for a world that the radar cannot record."""
-    if not scatterers.azimuth_m.shape[-1]:
-        raise ValueError("the scene holds no scatterer; give it at least one")
     if not bool((sin_squint.abs() < 1).all()):
         worst = float(sin_squint.abs().max())
         raise ValueError(
@@ -382,31 +323,3 @@ def _refuse_impossible(scatterers: Scatterers, radar: StripmapRadar, n_range: in
             f"a line of {n_range} samples does not hold the pulse of {radar.pulse_samples} samples; "
             "record longer lines (n_range) or shorten the pulse"
         )
-
-
-def apply_impairments(
-    recording: Recording, impairments: Mapping[str, Impairment], draws: Draws
-) -> tuple[Recording, dict[str, Tensor]]:
-    """Apply impairments to a recording, simulated or recorded.
-
-    A recording without the side data `line_number` (in `aux`) gets the line numbers 0, 1, ... in
-    the order of its pulses.
-
-    Args:
-        recording: Recording.
-        impairments: Impairments by name, applied in order.
-        draws: Random draws; each impairment draws its own random numbers, addressed by its name.
-
-    Returns:
-        The impaired recording, and the true values under "<impairment>.<name>".
-    """
-    if "line_number" not in recording.aux:
-        lines = torch.arange(recording.signal.data.shape[-2], device=recording.signal.data.device)
-        recording = replace(
-            recording, aux={**recording.aux, "line_number": lines.expand(recording.signal.data.shape[:-1])}
-        )
-    true_values: dict[str, Tensor] = {}
-    for name, impairment in impairments.items():
-        recording, values = impairment(recording, draws.part(name))
-        true_values.update({f"{name}.{key}": value for key, value in values.items()})
-    return recording, true_values

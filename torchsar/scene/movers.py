@@ -1,20 +1,19 @@
-"""Moving targets of a receiver on a straight track, and models of their ranges."""
+"""Moving targets of a receiver on a straight track."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Protocol
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from torchsar.core import Draws, per_trial
 from torchsar.radar import BistaticRadar
 from torchsar.radar.bistatic import receive_range
-from torchsar.scene.trials import refuse_unless, refuse_unless_finite, with_dims
+from torchsar.scene.targets import joined, unit_phases
+from torchsar.scene.trials import finite_numbers, refuse_unless, refuse_unless_finite, with_dims
 
 Numbers = Sequence[Tensor | float] | Tensor
 
@@ -54,18 +53,12 @@ class Bend:
         Returns:
             Deviation of zero for each target.
         """
-        return Bend(**{f.name: torch.zeros_like(like) for f in fields(Bend)})
+        return Bend(*(torch.zeros_like(like) for _ in fields(Bend)))
 
-    def each(self, change: Callable[[Tensor], Tensor]) -> Bend:
-        """Apply a function to every tensor of the deviation.
-
-        Args:
-            change: Function of a tensor of shape (..., target).
-
-        Returns:
-            Deviation that consists of the changed tensors.
-        """
-        return Bend(**{f.name: change(getattr(self, f.name)) for f in fields(Bend)})
+    @property
+    def tensors(self) -> tuple[Tensor, ...]:
+        """The coefficients in the order of the parameters."""
+        return tuple(vars(self).values())
 
     def square_m2(self, time_s: Tensor) -> Tensor:
         """Return the term that the deviation adds to the squared range to the receiver.
@@ -123,18 +116,20 @@ class Movers:
     bend: Bend | None = None
 
     def __post_init__(self) -> None:
-        real = (self.u_r_m_s, self.u_a_m_s, self.y0_m, self.range_m)
-        if any(x.dtype != torch.float64 for x in real) or not self.amplitude.is_complex():
-            raise TypeError(
-                "movers need float64 speeds and positions and complex amplitudes, got "
-                f"{[x.dtype for x in (*real, self.amplitude)]}"
-            )
-        counts = [x.shape[-1] if x.ndim else 0 for x in (*real, self.amplitude)]
+        dtypes = [x.dtype for x in self.tensors]
+        if any(dtype != torch.float64 for dtype in dtypes[:4]) or not dtypes[4].is_complex:
+            raise TypeError(f"movers need float64 speeds and positions and complex amplitudes, got {dtypes}")
+        counts = [x.shape[-1] if x.ndim else 0 for x in self.tensors]
         if len(set(counts)) != 1:
             raise ValueError(
                 "speeds, positions and amplitudes of movers must have the same number of targets (last dim), got "
                 f"{counts}"
             )
+
+    @property
+    def tensors(self) -> tuple[Tensor, ...]:
+        """Speeds, position, range and amplitude."""
+        return self.u_r_m_s, self.u_a_m_s, self.y0_m, self.range_m, self.amplitude
 
     def each(self, change: Callable[[Tensor], Tensor]) -> Movers:
         """Apply a function to every tensor of the targets, such as a move to another device.
@@ -145,10 +140,8 @@ class Movers:
         Returns:
             Targets that consist of the changed tensors.
         """
-        bend = None if self.bend is None else self.bend.each(change)
-        return Movers(
-            *(change(x) for x in (self.u_r_m_s, self.u_a_m_s, self.y0_m, self.range_m, self.amplitude)), bend=bend
-        )
+        bend = None if self.bend is None else Bend(*map(change, self.bend.tensors))
+        return Movers(*map(change, self.tensors), bend=bend)
 
     def closest_m(self, radar: BistaticRadar) -> Tensor:
         """Return the closest range R0.
@@ -241,13 +234,8 @@ def _numbers(values: Numbers) -> Tensor:
     return torch.stack(torch.broadcast_tensors(*(v.to(dtype) for v in entries)), -1)
 
 
-def _phases(turns: Tensor) -> Tensor:
-    """Unit phasors of phases in cycles."""
-    return torch.polar(torch.ones_like(turns), 2 * math.pi * turns)
-
-
 @dataclass(frozen=True)
-class MovingPoints:
+class MovingPoints(MovingScene):
     """Points with given positions, in uniform motion.
 
     Each parameter is a list with one entry per target (numbers, or one value per trial) or a tensor
@@ -285,24 +273,16 @@ class MovingPoints:
             )
 
     def movers(self, radar: BistaticRadar, draws: Draws) -> Movers:
-        """Draw the phases of the points.
-
-        Args:
-            radar: Radar parameters.
-            draws: Source of random numbers.
-
-        Returns:
-            Targets, shape (..., target).
-        """
         real = [_numbers(v) for v in (self.u_r_m_s, self.u_a_m_s, self.azimuth_m, self.range_m)]
         level = torch.ones_like(real[0]) if self.amplitude is None else _numbers(self.amplitude)
         if self.random_phase:
-            level = level * _phases(draws.uniform("scene.moving.phase", (level.shape[-1],))).to(level.device)
+            level = level * unit_phases(draws.uniform("scene.moving.phase", (level.shape[-1],))).to(level.device)
         return Movers(*torch.broadcast_tensors(*real, level.to(torch.complex128)))
 
 
 @dataclass(frozen=True)
-class Ship:
+@finite_numbers("a ship", length_m=0.0, cell_m=0.0)
+class Ship(MovingScene):
     """Extended target: scatterers of common motion at random positions along track.
 
     The scatterers are dealt out to several range cells in turn. All scatterers have the same
@@ -337,10 +317,6 @@ class Ship:
     level_db: Tensor | float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("u_r_m_s", "u_a_m_s", "azimuth_m", "range_m", "length_m", "cell_m", "level_db"):
-            refuse_unless_finite(
-                f"{name} of a ship", getattr(self, name), 0.0 if name in ("length_m", "cell_m") else -math.inf
-            )
         if not 1 <= self.range_cells <= self.count:
             raise ValueError(
                 "a ship needs at least one range cell and a scatterer for each, got "
@@ -348,15 +324,6 @@ class Ship:
             )
 
     def movers(self, radar: BistaticRadar, draws: Draws) -> Movers:
-        """Draw positions and phases of the scatterers.
-
-        Args:
-            radar: Radar parameters.
-            draws: Source of random numbers.
-
-        Returns:
-            Targets, shape (..., count).
-        """
         share = draws.uniform("scene.ship.azimuth", (self.count,))
         middle, length, range_m, cell = (
             with_dims(v, 1, share) for v in (self.azimuth_m, self.length_m, self.range_m, self.cell_m)
@@ -364,13 +331,13 @@ class Ship:
         y0 = middle + length * (share - 0.5)
         line = torch.arange(self.count, dtype=torch.float64) % self.range_cells - (self.range_cells - 1) / 2
         level = torch.sqrt(10 ** (per_trial(self.level_db, 1, y0) / 10) * self.range_cells / self.count)
-        amplitude = level * _phases(draws.uniform("scene.ship.phase", (self.count,)))
+        amplitude = level * unit_phases(draws.uniform("scene.ship.phase", (self.count,)))
         u_r, u_a = (per_trial(u, 1, y0) for u in (self.u_r_m_s, self.u_a_m_s))
         return Movers(*torch.broadcast_tensors(u_r, u_a, y0, range_m + line * cell, amplitude))
 
 
 @dataclass(frozen=True)
-class GroundMovers:
+class GroundMovers(MovingScene):
     """Points that move on flat ground, followed exactly in three dimensions.
 
     The ground lies the height h = radar.height_m below the track of the receiver. At slow time t, a
@@ -425,36 +392,19 @@ class GroundMovers:
         )
 
     def movers(self, radar: BistaticRadar, draws: Draws) -> Movers:
-        """Return the targets with their deviation from motion in the slant plane.
-
-        Args:
-            radar: Radar parameters.
-            draws: Source of random numbers.
-
-        Returns:
-            Targets, shape (..., target).
-        """
         w, along, ground = (_numbers(v) for v in (self.outward_m_s, self.along_m_s, self.ground_range_m))
         a, along_a = (torch.zeros_like(w) if v is None else _numbers(v) for v in (self.outward_m_s2, self.along_m_s2))
         closest = torch.sqrt(ground.square() + radar.height_m**2)
         u_r = -ground * w / closest
-        points = MovingPoints(u_r, along, self.azimuth_m, closest - radar.reference_range_m, self.amplitude).movers(
-            radar, draws
-        )
+        points = MovingPoints(u_r, along, self.azimuth_m, closest - radar.reference_range_m, self.amplitude)
         out, on = (with_dims(v, 1, w) for v in self.towards_transmitter)
-        bend = Bend(
-            out * w + on * along,
-            out * a + on * along_a,
-            along_a,
-            w.square() + ground * a - u_r.square(),
-            w * a,
-            a.square() / 4,
-        )
-        return replace(points, bend=bend)
+        to_transmitter = (out * w + on * along, out * a + on * along_a)
+        to_receiver = (w.square() + ground * a - u_r.square(), w * a, a.square() / 4)
+        return replace(points.movers(radar, draws), bend=Bend(*to_transmitter, along_a, *to_receiver))
 
 
 @dataclass(frozen=True)
-class Fleet:
+class Fleet(MovingScene):
     """Several moving scenes in one.
 
     Args:
@@ -464,163 +414,11 @@ class Fleet:
     parts: Mapping[str, MovingScene]
 
     def movers(self, radar: BistaticRadar, draws: Draws) -> Movers:
-        """Draw the targets of all parts.
-
-        Args:
-            radar: Radar parameters.
-            draws: Source of random numbers.
-
-        Returns:
-            Targets of all parts in order, shape (..., target).
-
-        Raises:
-            ValueError: If there is no part.
-        """
         parts = [scene.movers(radar, draws.part(name)) for name, scene in self.parts.items()]
         if not parts:
             raise ValueError("a fleet needs at least one scene; add a scene to `parts`, or leave the fleet out")
-        names = ("u_r_m_s", "u_a_m_s", "y0_m", "range_m", "amplitude")
-        bends = None if all(p.bend is None for p in parts) else [p.bend or Bend.none(p.u_r_m_s) for p in parts]
-        bend = (
-            None
-            if bends is None
-            else Bend(**{f.name: _joined([getattr(b, f.name) for b in bends]) for f in fields(Bend)})
-        )
-        return Movers(*(_joined([getattr(p, name) for p in parts]) for name in names), bend=bend)
-
-
-def _joined(parts: list[Tensor]) -> Tensor:
-    """Targets of all parts in one dimension, equal in all trials unless they are random."""
-    trials = np.broadcast_shapes(*(p.shape[:-1] for p in parts))
-    return torch.cat([p.expand(*trials, -1) for p in parts], -1)
-
-
-class ReceiveRange(Protocol):
-    """Model of the range from targets to the receiver."""
-
-    def range_m(self, movers: Movers, time_s: Tensor, radar: BistaticRadar) -> Tensor:
-        """Return the range relative to the reference range.
-
-        Args:
-            movers: Targets.
-            time_s: Slow time in seconds, shape (pulse,), float64.
-            radar: Radar parameters.
-
-        Returns:
-            Range in metres, shape (..., channel, pulse, target), float64.
-        """
-        ...
-
-    def neglected_phase_rad(self, movers: Movers, time_s: Tensor, radar: BistaticRadar) -> Tensor:
-        """Return the largest phase that the model neglects.
-
-        Args:
-            movers: Targets.
-            time_s: Slow time in seconds, shape (pulse,), float64.
-            radar: Radar parameters.
-
-        Returns:
-            Phase in radians, shape (...,).
-        """
-        ...
-
-
-@dataclass(frozen=True)
-class ExactRange:
-    """Exact range by the square root: the default, as fast as any series."""
-
-    def range_m(self, movers: Movers, time_s: Tensor, radar: BistaticRadar) -> Tensor:
-        """Return the exact range from each target to each channel, relative to the reference range.
-
-        Args:
-            movers: Targets.
-            time_s: Slow time in seconds, shape (pulse,), float64.
-            radar: Radar parameters.
-
-        Returns:
-            Range in metres, shape (..., channel, pulse, target), float64.
-        """
-        return movers.range_m[..., None, None, :] + movers.excess_m(time_s, radar)
-
-    def neglected_phase_rad(self, movers: Movers, time_s: Tensor, radar: BistaticRadar) -> Tensor:
-        """Return zero, as nothing is neglected.
-
-        Args:
-            movers: Targets.
-            time_s: Slow time in seconds, shape (pulse,), float64.
-            radar: Radar parameters.
-
-        Returns:
-            Zeros, shape (...,).
-        """
-        return torch.zeros(movers.range_m.shape[:-1], dtype=torch.float64, device=time_s.device)
-
-
-@dataclass(frozen=True)
-class TaylorRange:
-    """Power series of the range to the receiver about the closest range.
-
-    For the range R_m to channel m and the closest range R0 the series is
-    R_m - R0 = R0 (x / 2 - x^2 / 8 + ...) with x = R_m^2 / R0^2 - 1. The same series holds for the
-    whole range history, and it converges for R_m < 1.4 R0. Order 2 is the parabola of the
-    publication, with u_r^2 instead of the misprinted u_a^2 in the last numerator of Eq. (3).
-
-    Args:
-        order: Twice the highest power of x that is kept: 2, 4, 6, ...
-
-    Raises:
-        ValueError: If the order is odd or below 2.
-
-    Reference:
-        Remote Sens. 2020, 12, 1703, Eqs. (3), (5).
-    """
-
-    order: int = 2
-
-    def __post_init__(self) -> None:
-        if self.order < 2 or self.order % 2:
-            raise ValueError(
-                f"order of a range series must be 2, 4, 6, ..., got {self.order}; give twice the number of terms"
-            )
-
-    def range_m(self, movers: Movers, time_s: Tensor, radar: BistaticRadar) -> Tensor:
-        """Return the range from each target to each channel by the series.
-
-        Args:
-            movers: Targets.
-            time_s: Slow time in seconds, shape (pulse,), float64.
-            radar: Radar parameters.
-
-        Returns:
-            Range relative to the reference range in metres, shape (..., channel, pulse, target),
-            float64.
-        """
-        closest = movers.closest_m(radar)[..., None, None, :]
-        excess = movers.excess_m(time_s, radar) / closest
-        x = excess * (excess + 2)
-        total = torch.zeros_like(x)
-        for n in range(self.order // 2, 0, -1):
-            total = (total + _binomial(n)) * x
-        return movers.range_m[..., None, None, :] + closest * total
-
-    def neglected_phase_rad(self, movers: Movers, time_s: Tensor, radar: BistaticRadar) -> Tensor:
-        """Return the largest phase error of the series over channels, pulses and targets.
-
-        Args:
-            movers: Targets.
-            time_s: Slow time in seconds, shape (pulse,), float64.
-            radar: Radar parameters.
-
-        Returns:
-            Phase in radians, shape (...,).
-        """
-        missed = ExactRange().range_m(movers, time_s, radar) - self.range_m(movers, time_s, radar)
-        return 2 * math.pi / radar.wavelength_m * missed.abs().amax((-3, -2, -1))
-
-
-def _binomial(n: int) -> float:
-    """Coefficient of x^n in sqrt(1 + x)."""
-    value = 1.0
-    for k in range(n):
-        value *= (0.5 - k) / (k + 1)
-    return value
+        bend = None
+        if any(part.bend is not None for part in parts):
+            bends = [part.bend or Bend.none(part.u_r_m_s) for part in parts]
+            bend = Bend(*map(joined, zip(*(one.tensors for one in bends), strict=True)))
+        return Movers(*map(joined, zip(*(part.tensors for part in parts), strict=True)), bend=bend)
