@@ -68,6 +68,10 @@ def range_of_point(radar: BistaticRadar, range_m: Value | None) -> Value:
 def tone_frequency_bound_hz(q: Value, duration_s: Value) -> Tensor:
     """Compute the bound of the frequency of a tone with unknown phase and amplitude.
 
+    >>> from torchsar import metrics
+    >>> round(float(metrics.tone_frequency_bound_hz(q=100.0, duration_s=2.0)), 4)  # 20 dB
+    0.0195
+
     The bound is sqrt(6) / (2 pi T sqrt(q)) = 0.39 / (T sqrt(q)). It is also the bound of the
     Doppler frequency of one point at the middle of its aperture, once its known quadratic phase is
     removed.
@@ -84,6 +88,10 @@ def tone_frequency_bound_hz(q: Value, duration_s: Value) -> Tensor:
 
 def reference_doppler_std_hz(q: Value, duration_s: Value) -> Tensor:
     """Compute a published curve for the error of the Doppler estimate of a point, 1 / (T sqrt(q)).
+
+    >>> from torchsar import metrics
+    >>> round(float(metrics.reference_doppler_std_hz(q=100.0, duration_s=2.0)), 4)  # 20 dB
+    0.05
 
     It is 2.6 times the Cramer-Rao bound of a tone and applies to a point with a known position in
     the beam. The bound for the Doppler centroid of the beam, estimated from a point of unknown
@@ -104,6 +112,12 @@ def reference_doppler_std_hz(q: Value, duration_s: Value) -> Tensor:
 
 def beam_centre_bound_hz(gain: Tensor, q: Value, rate_hz_s: Value, prf_hz: float) -> Tensor:
     """Compute the bound of the Doppler centroid of a beam from one point of unknown position.
+
+    >>> import torch
+    >>> from torchsar import metrics
+    >>> gain = torch.cos(torch.linspace(-1.57, 1.57, 200))  # 2 s at 100 Hz
+    >>> round(float(metrics.beam_centre_bound_hz(gain, q=100.0, rate_hz_s=50.0, prf_hz=100.0)), 2)
+    2.23
 
     Only the envelope g(t) of the echo, which is the antenna gain, carries information about the
     beam centre. The bound is Ka / sqrt(2 q G), where G is the integral of g'^2 divided by that of
@@ -134,6 +148,11 @@ def beam_centre_bound_hz(gain: Tensor, q: Value, rate_hz_s: Value, prf_hz: float
 def velocity_bound_m_s(q: Value, dwell_s: Value, velocity_m_s: Value, wavelength_m: Value, range_m: Value) -> Tensor:
     """Compute the bound of the effective velocity from points with unknown position and phase.
 
+    >>> from torchsar import metrics
+    >>> bound = metrics.velocity_bound_m_s(100.0, 2.0, 150.0, wavelength_m=0.03, range_m=10e3)
+    >>> round(float(bound), 4)
+    0.0377
+
     The amplitudes are unknown too, and the gain is constant over the dwell. The velocity v follows
     from the quadratic phase 2 pi v^2 t^2 / (lambda r), whose coefficient can be estimated with the
     standard deviation sqrt(180) / (T^2 sqrt(2 q)) rad/s^2.
@@ -156,6 +175,10 @@ def velocity_bound_m_s(q: Value, dwell_s: Value, velocity_m_s: Value, wavelength
 def pulse_phase_bound_rad(snr: Value, n_range: int, n_pulse: int | None = None) -> Tensor:
     """Compute the bound of the phase of one pulse where the scene is known, 1 / sqrt(2 N SNR).
 
+    >>> from torchsar import metrics
+    >>> round(float(metrics.pulse_phase_bound_rad(snr=0.5, n_range=100)), 4)
+    0.1
+
     Args:
         snr: Mean signal power of all samples over the noise variance.
         n_range: Number N of range samples of a pulse.
@@ -175,6 +198,13 @@ def pulse_phase_bound_rad(snr: Value, n_range: int, n_pulse: int | None = None) 
 
 def pulse_phase_bound_of_scene_rad(azimuth: Tensor, range_: Tensor, amplitude: Tensor, noise_std: Value) -> Tensor:
     """Compute the bound of the phase per pulse for scatterers with known positions.
+
+    >>> import torch
+    >>> from torchsar import metrics
+    >>> one = torch.ones(1, dtype=torch.complex128)  # one point in one range cell
+    >>> bound = metrics.pulse_phase_bound_of_scene_rad(one.expand(64, 1), one[None], one, 0.1)
+    >>> round(float(bound), 3)  # nearly 0.1 / sqrt(2)
+    0.07
 
     The complex amplitudes of the scatterers are unknown. With the phase psi_k of pulse k, the
     samples are

@@ -134,6 +134,12 @@ def _holds_weights(mask: Tensor) -> bool:
 def entropy(image: Tensor | Signal, of: str = "intensity", mask: Tensor | None = None) -> Tensor:
     """Compute the image entropy -sum p ln p in nats.
 
+    >>> import torch
+    >>> from torchsar import metrics
+    >>> two, flat = torch.tensor([[1.0, 0.0], [0.0, 1.0]]), torch.ones(8, 8)
+    >>> [round(float(metrics.entropy(image)), 3) for image in (two, flat)]  # ln 2 and ln 64
+    [0.693, 4.159]
+
     p = |I|^2 / sum |I|^2 for the intensity and |I| / sum |I| for the amplitude. The entropy is
     invariant to scale, 0 for an all-zero image, and ln(number of pixels) for a flat one.
     Differentiable. With respect to a pixel of value zero, the entropy of the amplitude has no
@@ -167,6 +173,12 @@ def entropy(image: Tensor | Signal, of: str = "intensity", mask: Tensor | None =
 
 def contrast(image: Tensor | Signal, of: str = "intensity", mask: Tensor | None = None) -> Tensor:
     """Compute the standard deviation over the mean of the intensity |I|^2, or of the amplitude |I|.
+
+    >>> import torch
+    >>> from torchsar import metrics
+    >>> image = torch.tensor([[0.0, 0.0], [0.0, 2.0]])  # one of four pixels holds all energy
+    >>> round(float(metrics.contrast(image)), 3), float(metrics.contrast(torch.ones(8, 8)))
+    (1.732, 0.0)
 
     0 for an all-zero image; 1 for the intensity of fully developed speckle. Differentiable.
 
@@ -209,6 +221,13 @@ def _norm(x: Tensor) -> Tensor:
 def correlation(image: Tensor | Signal, reference: Tensor | Signal) -> Tensor:
     """Compute the correlation rho = |<I, I0>| / (|I| |I0|) of two complex images.
 
+    >>> import torch
+    >>> from torchsar import metrics
+    >>> image = torch.tensor([[1.0, 2.0], [2j, 0.0]])
+    >>> other = torch.tensor([[1.0, 2.0], [0.0, 2.0]]) + 0j
+    >>> [round(float(metrics.correlation(x, image)), 3) for x in (5j * image, other)]
+    [1.0, 0.556]
+
     Invariant to a common gain and phase. 0 where one image is all zero.
 
     Args:
@@ -231,6 +250,12 @@ def correlation(image: Tensor | Signal, reference: Tensor | Signal) -> Tensor:
 def error_db(image: Tensor | Signal, reference: Tensor | Signal) -> Tensor:
     """Compute the relative error |I - I0|^2 / |I0|^2 of an image in dB.
 
+    >>> import torch
+    >>> from torchsar import metrics
+    >>> image = torch.ones(8, 8, dtype=torch.complex64)
+    >>> round(float(metrics.error_db(1.1 * image, image)), 2)
+    -20.0
+
     A difference in gain or phase counts as error; use `correlation` where those are arbitrary.
 
     Args:
@@ -252,6 +277,15 @@ def error_db(image: Tensor | Signal, reference: Tensor | Signal) -> Tensor:
 
 def error_after_gain_db(images: Tensor, references: Tensor) -> Tensor:
     """Compute the relative errors of images after multiplication by a common complex gain.
+
+    >>> import torch
+    >>> from torchsar import metrics
+    >>> image = torch.tensor([[1.0, 2.0], [2.0, 1.0]]) + 0j
+    >>> changed = 5j * (image + torch.tensor([[0.1, 0.0], [0.0, -0.1]]))
+    >>> round(float(metrics.error_db(changed, image)), 1)
+    14.2
+    >>> round(float(metrics.error_after_gain_db(changed, image)), 1)
+    -27.0
 
     One gain is used for all images: the one that fits them best to the references. Focusing methods
     and echo models may differ by such a constant without any loss of quality.

@@ -27,6 +27,11 @@ def _velocity_m_s(c: float, snr: Value, samples_per_sweep: Value, wavelength_m: 
 def velocity_free_offset_bound_m_s(snr: Value, samples_per_sweep: Value, wavelength_m: Value, sweep_s: Value) -> Tensor:
     """Compute the velocity bound of one period if the phases of up and down sweep are unknown.
 
+    >>> from torchsar import metrics
+    >>> ladar = {"snr": 10.0, "samples_per_sweep": 512, "wavelength_m": 1.55e-6, "sweep_s": 8e-6}
+    >>> round(1e3 * float(metrics.velocity_free_offset_bound_m_s(**ladar)), 2)  # mm/s
+    0.37
+
     The bound is (lambda / 2) sqrt(3 / g) / (2 pi T) with g = samples_per_sweep * snr and the
     duration T of one sweep. An estimate from the spectral peaks of the full sweeps reaches it.
 
@@ -44,6 +49,11 @@ def velocity_free_offset_bound_m_s(snr: Value, samples_per_sweep: Value, wavelen
 
 def velocity_segmented_bound_m_s(snr: Value, samples_per_sweep: Value, wavelength_m: Value, sweep_s: Value) -> Tensor:
     """Compute the velocity bound of estimates from the phases of half sweeps.
+
+    >>> from torchsar import metrics
+    >>> ladar = {"snr": 10.0, "samples_per_sweep": 512, "wavelength_m": 1.55e-6, "sweep_s": 8e-6}
+    >>> round(1e3 * float(metrics.velocity_segmented_bound_m_s(**ladar)), 2)  # mm/s
+    0.43
 
     Each sweep is split into two halves, and the velocity follows from the phase between their
     spectra (segmented interference). The bound is (lambda / 2) sqrt(4 / g) / (2 pi T) with g =
@@ -70,6 +80,11 @@ def velocity_known_offset_bound_m_s(
 ) -> Tensor:
     """Compute the velocity bound of one period if both sweeps join in phase at the turning point.
 
+    >>> from torchsar import metrics
+    >>> ladar = {"snr": 10.0, "samples_per_sweep": 512, "wavelength_m": 1.55e-6, "sweep_s": 8e-6}
+    >>> round(1e3 * float(metrics.velocity_known_offset_bound_m_s(**ladar)), 2)  # mm/s
+    0.19
+
     They do so if the sampling of the sweeps is triggered exactly at the turning point. The bound is
     (lambda / 2) sqrt(0.75 / g) / (2 pi T) with g = samples_per_sweep * snr and the duration T of
     one sweep, 7.3 dB below `velocity_segmented_bound_m_s`.
@@ -89,6 +104,11 @@ def velocity_known_offset_bound_m_s(
 def range_per_sweep_bound_m(snr: Value, samples_per_sweep: Value, wavelength_m: Value) -> Tensor:
     """Compute the bound of the range from the carrier phase of a sweep, lambda / (4 pi sqrt(2 g)).
 
+    >>> from torchsar import metrics
+    >>> bound = metrics.range_per_sweep_bound_m(10.0, samples_per_sweep=512, wavelength_m=1.55e-6)
+    >>> round(1e9 * float(bound), 2)  # nm
+    1.22
+
     Here g = samples_per_sweep * snr. All other parameters are known. Errors of successive sweeps
     are independent and do not accumulate.
 
@@ -105,6 +125,11 @@ def range_per_sweep_bound_m(snr: Value, samples_per_sweep: Value, wavelength_m: 
 
 def integrated_range_detrended_bound_m(velocity_std_m_s: Value, pulse_step_s: Value, n_period: Value) -> Tensor:
     """Compute the rms error of a range history that is integrated from estimated velocities.
+
+    >>> from torchsar import metrics
+    >>> bound = metrics.integrated_range_detrended_bound_m(0.43e-3, 16e-6, n_period=1024)
+    >>> round(1e9 * float(bound), 1)  # nm
+    56.8
 
     The errors of M velocities are independent, so that the range error is a random walk. After
     removal of the best line from it, its rms is velocity_std_m_s * pulse_step_s * sqrt(M / 15). At

@@ -23,6 +23,15 @@ def line_of_sight_bound_m(
 ) -> Tensor:
     """Compute the least error of the line of sight of all pulses, without its linear terms.
 
+    >>> import torch
+    >>> from torchsar import metrics, radar
+    >>> place = torch.tensor([[-700.0, y, 700.0] for y in range(-20, 20, 4)], dtype=torch.float64)
+    >>> path = radar.AntennaPath(place, None, 2 * place.norm(dim=-1))
+    >>> point, frequency = torch.zeros(1, 3).double(), 9.6e9 + 1e7 * torch.arange(16.0).double()
+    >>> bound = metrics.line_of_sight_bound_m(frequency, path, point, torch.ones(1) + 0j, 0.1)
+    >>> round(1e6 * float(bound), 1)  # micrometres
+    39.0
+
     The samples are those of point scatterers in white circular Gaussian noise. Unknown are one
     range per pulse, and the horizontal position and the complex amplitude of each scatterer. A
     constant and a linear term of the range over the pulses, which act as a displacement of the

@@ -33,6 +33,15 @@ def rotation_bounds(
 ) -> dict[str, Tensor]:
     """Compute the least standard deviations of the rotation parameters of a target.
 
+    >>> import torch
+    >>> from torchsar import metrics
+    >>> x, y = torch.tensor([-10.0, 0.0, 10.0]), torch.tensor([5.0, -5.0, 0.0])  # three scatterers
+    >>> turntable = {"wavelength_m": 0.03, "prf_hz": 100.0, "n_pulse": 256}
+    >>> rate = 0.02, torch.tensor([0.1])  # rad/s, and its relative change per second
+    >>> bounds = metrics.rotation_bounds(x, y, torch.ones(3), 0.1, *rate, **turntable)
+    >>> {name: float(f"{float(std):.2g}") for name, std in bounds.items()}
+    {'omega_rad_s': 0.00014, 'k1_per_s': 0.0002, 'yc_m': 0.049}
+
     The rotation angle is Om phi(t), with the rate Om at the first pulse and the warped time phi(t)
     = t + k1 t^2 / 2! + k2 t^3 / 3! + ... The range centre deviation yc is the distance by which the
     rotation centre differs from the assumed one. Noise and ranges are known; the complex amplitude
