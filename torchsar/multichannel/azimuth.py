@@ -96,6 +96,14 @@ def focus_azimuth(
 class FocusAzimuth(Stage):
     """Stage that focuses one target per trial in azimuth, with its velocities.
 
+    >>> from torchsar import Draws, echo, multichannel, radar, scene
+    >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)
+    >>> world = scene.BistaticWorld(scene.MovingPoints([0], [0], [30], [0]), scene.BandLimited(1.0))
+    >>> channels = echo.simulate_bistatic(receiver, world, 360, None, Draws(seed=1))[0].signal
+    >>> image = multichannel.FocusAzimuth(receiver)(multichannel.Reconstruct(receiver)(channels))
+    >>> image.axis("azimuth").values()[image.data.abs().argmax()].round().item()
+    30.0
+
     The input is a spectrum (doppler[, range]) of `Reconstruct`, the output an image (azimuth[,
     range]). Azimuth is x = V_R t in metres, with the speed V_R of the receiver and slow time t. A
     width w on this axis is a width w (V_R - u_a) / V_R along a target that moves at the along-track

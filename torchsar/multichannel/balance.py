@@ -48,6 +48,14 @@ def correct_balance(
 ) -> Tensor:
     """Remove phase, gain and delay differences between the channels.
 
+    >>> import torch
+    >>> from torchsar import multichannel, radar
+    >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)
+    >>> phase_rad, gain_db = torch.tensor([0.0, 0.0, 1.0]).double(), torch.zeros(3)
+    >>> channels = torch.exp(1j * phase_rad)[:, None, None].expand(3, 4, 8)
+    >>> multichannel.correct_balance(channels, receiver, phase_rad, gain_db)[:, 0, 0].real.round()
+    tensor([1., 1., 1.], dtype=torch.float64)
+
     Each channel is divided by 10^(gain_db / 20) exp(j phase), and its envelope is advanced in range
     time by its delay; the delay does not change the carrier phase. Differentiable.
 

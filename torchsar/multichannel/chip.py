@@ -38,6 +38,10 @@ TINY = 1e-100  # floor of divisors, far from the overflow of reciprocals
 class Extraction:
     """Extent of the data that are extracted for one body, an extended moving target.
 
+    >>> from torchsar import multichannel
+    >>> multichannel.Extraction(along_m=60.0, integration_s=2.0)
+    Extraction(along_m=60.0, range_m=60.0, integration_s=2.0, segment_s=1.0)
+
     Args:
         along_m: Half width along track about the middle of the body in metres.
         range_m: Half width in range about the middle of the body in metres.

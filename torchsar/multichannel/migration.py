@@ -39,6 +39,14 @@ _EPS = {torch.complex64: 1e-5, torch.complex128: 1e-10}
 class Frame:
     """Radar and axes of data (..., channel, pulse, range), from which range histories follow.
 
+    >>> import torch
+    >>> from torchsar import multichannel, radar
+    >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)
+    >>> frame = multichannel.Frame(receiver, torch.tensor([0.0, 1.0]), torch.tensor([5000.0]))
+    >>> path_m = frame.path_m(multichannel.PointMotion.of(receiver, torch.zeros(())))
+    >>> [round(x, 1) for x in path_m[1].tolist()]  # middle channel
+    [0.0, 9.0]
+
     Args:
         radar: Radar parameters.
         time_s: Slow time in seconds, float64 (pulse,).
@@ -105,7 +113,16 @@ class Frame:
 
 @dataclass(frozen=True)
 class NoMigration:
-    """No range migration correction."""
+    """Method that leaves the range migration uncorrected.
+
+    >>> import torch
+    >>> from torchsar import Signal, multichannel, radar
+    >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)
+    >>> channels = Signal(torch.ones(3, 4, 8, dtype=torch.complex64), receiver.axes(4, 8))
+    >>> same = multichannel.CorrectMigration(receiver, multichannel.NoMigration())(channels)
+    >>> bool((same.data == channels.data).all())
+    True
+    """
 
     def apply(self, data: Tensor, frame: Frame, reference: PointMotion, ambiguity: Tensor) -> Tensor:
         """Return the data unchanged."""
@@ -115,6 +132,14 @@ class NoMigration:
 @dataclass(frozen=True)
 class StaticBulk:
     """Migration correction by a shift of every pulse along range by a reference range history.
+
+    >>> from torchsar import Draws, echo, multichannel, radar, scene
+    >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)
+    >>> world = scene.BistaticWorld(scene.MovingPoints([20], [0], [0], [0]), scene.BandLimited(1.0))
+    >>> channels = echo.simulate_bistatic(receiver, world, 170, 64, Draws(seed=1))[0].signal
+    >>> shifted = multichannel.CorrectMigration(receiver, multichannel.StaticBulk())(channels)
+    >>> len(shifted.data[1].abs().argmax(-1).unique())  # range cells of the point, which walks
+    5
 
     Exact for a point that moves as the reference does, whatever its Doppler ambiguity. The range
     walk of other points relative to the reference remains.
@@ -135,6 +160,14 @@ class StaticBulk:
 @dataclass(frozen=True)
 class Keystone:
     """Migration correction that removes the range walk of all targets by a keystone transform.
+
+    >>> from torchsar import Draws, echo, multichannel, radar, scene
+    >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)
+    >>> world = scene.BistaticWorld(scene.MovingPoints([20], [0], [0], [0]), scene.BandLimited(1.0))
+    >>> channels = echo.simulate_bistatic(receiver, world, 170, 64, Draws(seed=1))[0].signal
+    >>> still = multichannel.CorrectMigration(receiver, multichannel.Keystone())(channels)
+    >>> len(still.data[1].abs().argmax(-1).unique())  # range cells of a point of unknown speed
+    1
 
     The range history of the reference is removed before the transform (deramp) and restored in the
     carrier phase after it (reramp). The ambiguity number q must be that of the target: |F - F_ref -
@@ -261,6 +294,14 @@ def correct_migration(
 
 class CorrectMigration(Stage):
     """Stage that corrects the range migration of range-compressed channels (channel, pulse, range).
+
+    >>> from torchsar import Draws, echo, multichannel, radar, scene
+    >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)
+    >>> world = scene.BistaticWorld(scene.MovingPoints([20], [0], [0], [0]), scene.BandLimited(1.0))
+    >>> channels = echo.simulate_bistatic(receiver, world, 170, 64, Draws(seed=1))[0].signal
+    >>> corrected = multichannel.CorrectMigration(receiver)(channels, u_r_m_s=20.0)
+    >>> [len(x.data[1].abs().argmax(-1).unique()) for x in (channels, corrected)]  # range cells
+    [4, 1]
 
     Azimuth-only data (channel, pulse), which do not migrate, pass unchanged.
 

@@ -19,6 +19,13 @@ _VALUES = ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")
 class PointMotion:
     """Velocity and position of one point per trial, and the speed of the receiver.
 
+    >>> import torch
+    >>> from torchsar import multichannel, radar
+    >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)
+    >>> motion = multichannel.PointMotion.of(receiver, torch.zeros(()), u_r_m_s=3.0)
+    >>> round(receiver.speed_m_s * motion.image_s.item())  # m, by which an image shows it displaced
+    50
+
     The tensors are float64 and broadcast to (...,). The derived quantities use v = V_R - u_a and
     V^2 = v^2 + u_r^2.
 

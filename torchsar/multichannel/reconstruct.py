@@ -61,6 +61,10 @@ def first_bin(n_pulse: int, bands: int) -> int:
 def doppler_offsets(n_pulse: int, bands: int, prf_hz: float, device: torch.device | str | None = None) -> Tensor:
     """Return the Doppler of all bins of a reconstructed spectrum relative to its centre.
 
+    >>> from torchsar import multichannel
+    >>> multichannel.doppler_offsets(n_pulse=2, bands=3, prf_hz=180.0).tolist()
+    [-270.0, -180.0, -90.0, 0.0, 90.0, 180.0]
+
     Args:
         n_pulse: Number of pulses.
         bands: Number of bands.
@@ -163,6 +167,14 @@ def doppler_centre_hz(radar: BistaticRadar, motion: PointMotion, left_k1_m_s: fl
 class ElementPattern:
     """Expected power over Doppler by the one-way antenna pattern of a channel.
 
+    >>> import torch
+    >>> from torchsar import multichannel, radar
+    >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)
+    >>> still = multichannel.PointMotion.of(receiver, torch.zeros(()))
+    >>> offset_hz = torch.tensor([0.0, 90.0, 180.0])
+    >>> multichannel.ElementPattern().power(offset_hz, receiver, still).round(decimals=1).tolist()
+    [1.0, 0.8, 0.4]
+
     The pattern is sinc^2(L sin(look) / lambda) with the length L = `radar.element_m` of the
     aperture of a channel. The look angle from broadside follows from sin(look) = -lambda offset /
     v, with the Doppler offset from the centre and the along-track speed v of the receiver relative
@@ -186,6 +198,14 @@ class ElementPattern:
 @dataclass(frozen=True)
 class FlatBand:
     """Expected power that is equal within a band about the Doppler centre and zero outside.
+
+    >>> import torch
+    >>> from torchsar import multichannel, radar
+    >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)
+    >>> still = multichannel.PointMotion.of(receiver, torch.zeros(()))
+    >>> offset_hz = torch.tensor([0.0, 90.0, 180.0])
+    >>> multichannel.FlatBand(250.0).power(offset_hz, receiver, still).tolist()
+    [1.0, 1.0, 0.0]
 
     Args:
         bandwidth_hz: Width of the band in Hz.
@@ -218,6 +238,14 @@ def _check_bands(bands: int) -> None:
 @dataclass(frozen=True)
 class LeastSquares:
     """Reconstruction of Doppler bands by the pseudo-inverse of the channel responses.
+
+    >>> import torch
+    >>> from torchsar import multichannel, radar
+    >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)
+    >>> still = multichannel.PointMotion.of(receiver, torch.zeros(()))
+    >>> methods = multichannel.LeastSquares(2), multichannel.LeastSquares(3)  # bands
+    >>> [round(multichannel.noise_gain_db(receiver, still, method).item(), 1) for method in methods]
+    [0.5, 12.2]
 
     This is Eq. (36) for any number of channels. The pseudo-inverse is the inverse where there are
     as many bands as channels. Singular values below 1e-6 of the largest are damped, so that the
@@ -255,6 +283,14 @@ class LeastSquares:
 @dataclass(frozen=True)
 class MinimumMeanSquare:
     """Reconstruction of Doppler bands with least mean square error, for an expected power.
+
+    >>> import torch
+    >>> from torchsar import multichannel, radar
+    >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)
+    >>> still = multichannel.PointMotion.of(receiver, torch.zeros(()))
+    >>> methods = multichannel.LeastSquares(3), multichannel.MinimumMeanSquare(3, snr_db=10.0)
+    >>> [round(multichannel.noise_gain_db(receiver, still, method).item(), 1) for method in methods]
+    [12.2, 0.3]
 
     The weights are A G^H (G A G^H + I / snr)^-1, with the channel responses G to the bands, the
     diagonal matrix A of the expected powers of the bands relative to the peak, and the power ratio
@@ -365,6 +401,13 @@ def condition_number(radar: BistaticRadar, motion: PointMotion, bands: int) -> T
 
 def noise_gain_db(radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, n_pulse: int = 64) -> Tensor:
     """Return the noise gain of a reconstruction relative to ideal uniform sampling.
+
+    >>> import torch
+    >>> from torchsar import multichannel, radar
+    >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)
+    >>> motion = multichannel.PointMotion.of(receiver, torch.zeros(()), u_r_m_s=3.0)
+    >>> round(multichannel.noise_gain_db(receiver, motion, multichannel.LeastSquares(2)).item(), 1)
+    0.5
 
     It is the mean noise power of the reconstructed Doppler bins divided by the noise power that
     uniform sampling with the same number of channels would give: M / N trace(W W^H) for the weights

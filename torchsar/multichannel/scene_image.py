@@ -41,6 +41,14 @@ Removal = Literal["subtract", "zero"]
 class Detector:
     """Settings of the detection of moving targets in images.
 
+    >>> import torch
+    >>> from torchsar import Axis, Signal, multichannel
+    >>> axes = Axis("azimuth", 256, -256.0, 2.0, "m"), Axis("range", 64, 4840.0, 5.0, "m")
+    >>> image = torch.ones(256, 64, dtype=torch.complex64)
+    >>> image[168:188, 31:34], image[40:60, 10:13] = 10, 5  # two ships
+    >>> [len(multichannel.Detector(level).found(Signal(image, axes))) for level in (5, 15)]  # dB
+    [2, 1]
+
     Args:
         threshold_db: Least contrast of a target in dB: the mean intensity of a small rectangle of
             pixels (neighbourhood) relative to the median over all of them.
@@ -77,6 +85,14 @@ class Detector:
 class SceneImage:
     """Images of a scene with moving targets.
 
+    >>> import torch
+    >>> from torchsar import Signal, multichannel, radar
+    >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)
+    >>> channels = Signal(torch.ones(3, 32, 64, dtype=torch.complex64), receiver.axes(32, 64))
+    >>> images = multichannel.ImageMovers(receiver)(channels, known=[])
+    >>> images.fused.names, len(images.bodies)
+    (('azimuth', 'range'), 0)
+
     Args:
         conventional: Image (azimuth, range) of all data as if the whole scene were stationary.
         rest: Image of the data without the moving targets.
@@ -98,6 +114,16 @@ class SceneImage:
 
 class ImageMovers(Stage):
     """Stage that images a scene and its moving targets, from channels to a `SceneImage`.
+
+    >>> from torchsar import Draws, echo, multichannel, radar, scene
+    >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)
+    >>> world = scene.BistaticWorld(scene.MovingPoints([6], [0], [0], [0]), scene.BandLimited(0.5))
+    >>> channels = echo.simulate_bistatic(receiver, world, 160, 84, Draws(seed=1))[0].signal
+    >>> images = multichannel.ImageMovers(receiver, multichannel.Extraction(60, 30, 0.5, 0.25))(
+    ...     channels, known=[multichannel.PointMotion.of(receiver, channels.data, 6.0)]
+    ... )
+    >>> [int(x.data.abs().amax(-1).argmax()) for x in (images.conventional, images.fused)]
+    [280, 160]
 
     The channels (channel, pulse, range) are range compressed, and the transmit range has been
     removed from their phase. One recording is processed at a time, since the number of targets
@@ -313,6 +339,17 @@ class ImageMovers(Stage):
 
 class MoversImage(Stage):
     """Stage for chains that images the scene and the moving targets of every trial.
+
+    >>> from torchsar import Draws, echo, multichannel, radar, scene
+    >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)
+    >>> world = scene.BistaticWorld(scene.MovingPoints([6], [0], [0], [0]), scene.BandLimited(0.5))
+    >>> recording, truth = echo.simulate_bistatic(receiver, world, 160, 84, Draws(seed=1))
+    >>> images = multichannel.MoversImage(
+    ...     receiver, multichannel.LeastSquares(2), "subtract",
+    ...     multichannel.Extraction(60, 30, 0.5, 0.25), multichannel.Detector(most=2),
+    ... )
+    >>> images(recording.signal, **{n: truth.values[n] for n in images.provides})[1]["u_r_m_s"]
+    tensor([6., 0.], dtype=torch.float64)
 
     It applies `ImageMovers` to each trial. Its outputs are the image with every moving target at
     its true position, and an estimate of the motions.
@@ -542,6 +579,14 @@ def detect(
     most: int = 16,
 ) -> list[Detection]:
     """Detect bright targets in one image, strongest first.
+
+    >>> import torch
+    >>> from torchsar import Axis, Signal, multichannel
+    >>> axes = Axis("azimuth", 256, -256.0, 2.0, "m"), Axis("range", 64, 4840.0, 5.0, "m")
+    >>> image = torch.ones(256, 64, dtype=torch.complex64)
+    >>> image[168:188, 31:34] = 10  # a ship
+    >>> [(round(x.azimuth_m), round(x.range_m)) for x in multichannel.detect(Signal(image, axes))]
+    [(98, 5000)]
 
     The image is divided into rectangles of pixels (neighbourhoods) that overlap by half. Their
     contrast is the mean intensity relative to the median over all of them. Any two detections are

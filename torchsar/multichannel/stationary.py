@@ -143,6 +143,14 @@ def focus_stationary(
 class StationaryImage(Stage):
     """Stage that forms the conventional image of range-compressed channels; see `stationary_image`.
 
+    >>> from torchsar import Draws, echo, multichannel, radar, scene
+    >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)
+    >>> world = scene.BistaticWorld(scene.MovingPoints([0], [0], [30], [0]), scene.BandLimited(1.0))
+    >>> channels = echo.simulate_bistatic(receiver, world, 360, 32, Draws(seed=1))[0].signal
+    >>> image = multichannel.StationaryImage(receiver)(channels)
+    >>> image.axis("azimuth").values()[image.data[:, 16].abs().argmax()].round().item()
+    30.0
+
     The input has the axes (channel, pulse, range), the output the axes (azimuth, range) in metres.
 
     Args:

@@ -129,6 +129,14 @@ def remove_synchronisation(
 class EstimateSynchronisation(ChannelStage):
     """Stage that estimates the clock phase and delay of each pulse from a recorded direct path.
 
+    >>> import torch
+    >>> from torchsar import Signal, multichannel, radar
+    >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)
+    >>> direct = 1j * torch.sinc((torch.arange(64) - 32) / 1.2).expand(2, 64)  # at 90 degrees
+    >>> channels = Signal(torch.ones(3, 2, dtype=torch.complex64), receiver.axes(2))
+    >>> multichannel.EstimateSynchronisation(receiver)(channels, direct)["phase_rad"].rad2deg()
+    tensor([90., 90.], dtype=torch.float64)
+
     See `estimate_synchronisation`. Where the direct path is side data of the recording, connect it
     as `use(EstimateSynchronisation(radar), direct_path="aux.direct_path")`. The signal is not
     changed.
@@ -170,6 +178,14 @@ class EstimateSynchronisation(ChannelStage):
 
 class RemoveSynchronisation(ChannelStage):
     """Stage that removes estimated or known clock phases and delays from every pulse.
+
+    >>> import torch
+    >>> from torchsar import Signal, multichannel, radar
+    >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)
+    >>> phase_rad = torch.tensor([0.0, 1.0, 3.0, 2.0])  # of each pulse
+    >>> channels = Signal(torch.polar(torch.ones(3, 4), phase_rad.expand(3, 4)), receiver.axes(4))
+    >>> multichannel.RemoveSynchronisation(receiver)(channels, phase_rad).data[0].real.round()
+    tensor([1., 1., 1., 1.])
 
     See `remove_synchronisation`.
 

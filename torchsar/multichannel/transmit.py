@@ -29,6 +29,14 @@ def remove_transmit_range(
 ) -> Tensor:
     """Remove the transmit range from the phase, so that the phase of the receive path remains.
 
+    >>> import torch
+    >>> from torchsar import multichannel
+    >>> time_s = torch.arange(4, dtype=torch.float64) / 180.0
+    >>> channels = torch.exp(-2j * torch.pi * 10.0 * time_s / 0.24).expand(3, 4)  # 10 m/s, 0.24 m
+    >>> left = multichannel.remove_transmit_range(channels, time_s, [10.0], 0.24, with_range=False)
+    >>> left[0].real.round(decimals=6)
+    tensor([1., 1., 1., 1.], dtype=torch.float64)
+
     Data are multiplied by exp(+j 2 pi / lambda (R_T(t) - R_T(0))) where the change of the transmit
     range is R_T(t) - R_T(0) = k1 t + k2 t^2 + .... This is exact, since the transmit range is
     common to all channels. Envelopes are not shifted: the receive window follows the transmit
@@ -198,6 +206,14 @@ class AzimuthScaling(ChannelStage):
 
 class CompressChannels(Stage):
     """Range compression with the transmitted pulse; a unit echo has a unit peak at its range.
+
+    >>> from torchsar import Draws, echo, multichannel, radar, scene
+    >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)
+    >>> world = scene.BistaticWorld(scene.MovingPoints([0], [0], [0], [0]), scene.BandLimited(1.0))
+    >>> recording, _ = echo.simulate_bistatic(receiver, world, 4, 2048, Draws(seed=1), kind="full")
+    >>> channels = multichannel.CompressChannels(receiver)(recording.signal)
+    >>> channels.data.abs().argmax(-1)[0]  # sample n // 2 lies at the reference range
+    tensor([1024, 1024, 1024, 1024])
 
     An echo whose pulse is cut by an end of the range line is compressed with the samples that
     remain.

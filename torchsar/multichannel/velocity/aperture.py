@@ -17,6 +17,13 @@ from torchsar.radar import BistaticRadar
 class Dwell:
     """Expected amplitude 1 for a duration centred on the time at broadside, 0 outside.
 
+    >>> import torch
+    >>> from torchsar import multichannel, radar
+    >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)
+    >>> still = multichannel.PointMotion.of(receiver, torch.zeros(()))
+    >>> multichannel.Dwell(1.5).weight(receiver, still, torch.tensor([-1.0, -0.5, 0.0, 0.5, 1.0]))
+    tensor([0., 1., 1., 1., 0.], dtype=torch.float64)
+
     The time at broadside follows from the motion of the point, without a gradient. Estimators
     therefore do not fit the ends of the interval to the data.
 
@@ -53,6 +60,14 @@ class Dwell:
 @dataclass(frozen=True)
 class ElementBeam:
     """Expected amplitude by the one-way antenna pattern of a channel.
+
+    >>> import torch
+    >>> from torchsar import multichannel, radar
+    >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)
+    >>> still = multichannel.PointMotion.of(receiver, torch.zeros(()))
+    >>> weight = multichannel.ElementBeam().weight(receiver, still, torch.tensor([0.0, 1.0, 3.0]))
+    >>> [round(value, 2) for value in weight.tolist()]  # after 0, 1 and 3 s
+    [1.0, 0.94, 0.52]
 
     The pattern is sinc(L sin(look) / lambda) with the length L = `radar.element_m` of the aperture
     of a channel and the look angle from broadside. Side lobes and their signs are included.

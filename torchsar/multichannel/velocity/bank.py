@@ -26,6 +26,11 @@ from torchsar.radar import BistaticRadar
 class Search:
     """Extent and steps of a search over the velocities and the position of a point.
 
+    >>> from torchsar import multichannel
+    >>> search = multichannel.Search(u_r_m_s=12.0)
+    >>> 2 * search.u_r_m_s / search.u_r_step_m_s  # steps of the slant-range speed
+    8.0
+
     The default steps suit apertures of about 4.5 s at 300 m/s and 5 km.
 
     Args:

@@ -136,6 +136,14 @@ def refuse_full_band(radar: BistaticRadar, rebuild: Rebuild, bandwidth_hz: float
 class SignalIntensityRatio(ChannelStage):
     """Stage that estimates the slant-range speed u_r by the signal intensity ratio Gamma.
 
+    >>> from torchsar import Draws, echo, multichannel, radar, scene
+    >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 220, 300, 5000)
+    >>> world = scene.BistaticWorld(scene.MovingPoints([3], [0], [0], [0]), scene.BandLimited(1.0))
+    >>> channels = echo.simulate_bistatic(receiver, world, 360, None, Draws(seed=1))[0].signal
+    >>> ratio = multichannel.SignalIntensityRatio(receiver, bandwidth_hz=75.0, search_m_s=(1, 5))
+    >>> round(ratio(channels)["u_r_m_s"].item())
+    3
+
     A spectrum that is reconstructed with the right speed concentrates in the processed Doppler
     band. Gamma compares the energies and amplitudes inside and outside this band, and its maximum
     is sought in each trial. A grid search is refined by parabolic interpolation about its best

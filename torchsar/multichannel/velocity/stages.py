@@ -211,6 +211,14 @@ class Interferometry(_Velocity):
 class AlongTrackAutofocus(_Velocity):
     """Stage that estimates the along-track speed by the power of the deramped tone.
 
+    >>> from torchsar import Draws, echo, multichannel, radar, scene
+    >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)
+    >>> world = scene.BistaticWorld(scene.MovingPoints([3], [8], [0], [0]), scene.BandLimited(1.0))
+    >>> channels = echo.simulate_bistatic(receiver, world, 200, None, Draws(seed=1))[0].signal
+    >>> autofocus = multichannel.AlongTrackAutofocus(receiver, multichannel.Dwell(1.0), half_m_s=9)
+    >>> round(autofocus(channels, u_r_m_s=3.0)["u_a_m_s"].item(), 1)
+    8.0
+
     See `along_track_velocity`.
 
     Args:
@@ -258,6 +266,14 @@ class AlongTrackAutofocus(_Velocity):
 
 class LikelihoodVelocity(_Velocity):
     """Stage that estimates velocity and position by maximum likelihood near a start.
+
+    >>> from torchsar import Draws, echo, multichannel, radar, scene
+    >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)
+    >>> world = scene.BistaticWorld(scene.MovingPoints([3], [0], [0], [0]), scene.BandLimited(1.0))
+    >>> channels = echo.simulate_bistatic(receiver, world, 200, None, Draws(seed=1))[0].signal
+    >>> velocity = multichannel.LikelihoodVelocity(receiver, multichannel.Dwell(1.0))
+    >>> round(velocity(channels, u_r_m_s=2.9)["u_r_m_s"].item(), 2)
+    3.0
 
     See `maximum_likelihood`.
 
@@ -319,6 +335,14 @@ class LikelihoodVelocity(_Velocity):
 
 class GradientVelocity(LikelihoodVelocity):
     """Stage that estimates velocity and position by maximum likelihood with autograd gradients.
+
+    >>> from torchsar import Draws, echo, multichannel, radar, scene
+    >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)
+    >>> world = scene.BistaticWorld(scene.MovingPoints([3], [0], [0], [0]), scene.BandLimited(1.0))
+    >>> channels = echo.simulate_bistatic(receiver, world, 200, None, Draws(seed=1))[0].signal
+    >>> velocity = multichannel.GradientVelocity(receiver, multichannel.Dwell(1.0))
+    >>> round(velocity(channels, u_r_m_s=2.95)["u_r_m_s"].item(), 2)
+    3.0
 
     See `gradient_likelihood`; arguments as those of `LikelihoodVelocity`.
     """

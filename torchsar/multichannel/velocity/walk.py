@@ -22,6 +22,13 @@ from torchsar.radar import BistaticRadar
 class WalkAmbiguity(Stage):
     """Stage that estimates the PRF ambiguity number of the strongest point from its range walk.
 
+    >>> from torchsar import Draws, echo, multichannel, radar, scene
+    >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)
+    >>> world = scene.BistaticWorld(scene.MovingPoints([43], [0], [0], [0]), scene.BandLimited(1.0))
+    >>> channels = echo.simulate_bistatic(receiver, world, 180, 64, Draws(seed=1))[0].signal
+    >>> int(multichannel.WalkAmbiguity(receiver)(channels)["ambiguity"])  # lambda PRF is 43.2 m/s
+    1
+
     The range migration is corrected with each number in turn. The criterion is the energy of the
     strongest range line, which depends neither on phases nor on aliasing in azimuth.
     `CorrectMigration` accepts the estimate as its input `ambiguity`.
@@ -86,6 +93,14 @@ class WalkAmbiguity(Stage):
 
 class MigratingLines(Stage):
     """Stage that estimates a velocity from range lines whose migration has not been corrected.
+
+    >>> from torchsar import Draws, echo, multichannel, radar, scene
+    >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)
+    >>> world = scene.BistaticWorld(scene.MovingPoints([20], [0], [0], [0]), scene.BandLimited(1.0))
+    >>> channels = echo.simulate_bistatic(receiver, world, 180, 48, Draws(seed=1))[0].signal
+    >>> velocity = multichannel.Interferometry(receiver, multichannel.Dwell(1.0))
+    >>> round(multichannel.MigratingLines(receiver, velocity)(channels)["u_r_m_s"].item(), 1)
+    20.0
 
     The estimator gets a copy of the data in which the migration of a point at rest and the range
     walk of the strongest point are corrected. An along-track speed leaves a curved migration, which
