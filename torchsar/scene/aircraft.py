@@ -59,6 +59,11 @@ def along_line(corners: Tensor, spacing_m: float) -> Tensor:
 class Aircraft(Scene):
     """Outline of an aircraft with swept wings, tail plane and fin, about 600 scatterers.
 
+    >>> from torchsar import Draws, scene
+    >>> points = scene.Aircraft(length_m=0.2).scatterers(Draws(seed=1, trials=range(3)))
+    >>> points.amplitude.shape, round(float(points.azimuth_m.max()), 2)
+    (torch.Size([3, 625]), 0.1)
+
     The fuselage lies along cross range; ranges count from the middle of the window. The publication
     gives no coordinates of its target; this model reproduces the pattern of the published image
     entropies. Each trial draws circular Gaussian amplitudes (Rayleigh magnitude, uniform phase,
@@ -111,6 +116,11 @@ class Aircraft(Scene):
 @finite_numbers("spread rows", width=None, extent_m="positive", range_step_m="positive")
 class SpreadRows(Scene):
     """Occupied range cells with several scatterers of unit amplitude in each.
+
+    >>> from torchsar import Draws, scene
+    >>> rows = scene.SpreadRows(2, 3, width=0.5, extent_m=8.0, range_step_m=0.5, range_cells=8)
+    >>> rows.scatterers(Draws(seed=1)).range_m.tolist()
+    [-1.0, -1.0, -1.0, 1.0, 1.0, 1.0]
 
     The occupied cells are spread evenly over the window and lie on its grid, where sample
     range_cells // 2 is range zero; all other cells are empty. Phases and cross ranges are random.

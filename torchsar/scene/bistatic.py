@@ -41,6 +41,13 @@ class Gate(Protocol):
 class BandLimited(Gate):
     """Gate that passes each target for a limited time, equal in all channels.
 
+    >>> from torchsar import Draws, radar, scene
+    >>> airborne = radar.BistaticRadar(10e9, radar.LinearFM(20e6, 5e-6), 24e6, 100.0, 100.0, 5000.0)
+    >>> target = scene.MovingPoints([0.0], [0.0], [0.0], [0.0]).movers(airborne, Draws(seed=1))
+    >>> time_s = airborne.pulse_axis(100).values()
+    >>> int(scene.BandLimited(duration_s=0.25).weight(target, time_s, airborne).sum())  # pulses
+    25
+
     The interval is centred on the time y0 / v of the closest approach along track, so that the
     Doppler band of the target is limited. y0 is the along-track position of the target at slow time
     zero and v the along-track speed of the receiver relative to the target.
@@ -65,6 +72,13 @@ class BandLimited(Gate):
 @finite_numbers("a pattern", element_m="positive")
 class Pattern(Gate):
     """One-way pattern of a uniformly illuminated antenna element over the whole record.
+
+    >>> from torchsar import Draws, radar, scene
+    >>> airborne = radar.BistaticRadar(10e9, radar.LinearFM(20e6, 5e-6), 24e6, 100.0, 100.0, 5000.0)
+    >>> pair = scene.MovingPoints([0.0, 0.0], [0.0, 0.0], azimuth_m=[0.0, 50.0], range_m=[0.0, 0.0])
+    >>> time_s, movers = airborne.pulse_axis(1).values(), pair.movers(airborne, Draws(seed=1))
+    >>> scene.Pattern().weight(movers, time_s, airborne)[1, 0].round(decimals=2).tolist()
+    [1.0, 0.89]
 
     The amplitude gain is sin(pi q) / (pi q) with q = element_m sin(look) / wavelength and
     sin(look) = (v t - y0 - dx_m) / R_m. Here t is the slow time, v the along-track speed of the
@@ -120,7 +134,15 @@ class ReceiveRange(Protocol):
 
 @dataclass(frozen=True)
 class ExactRange(ReceiveRange):
-    """Exact range by the square root: the default, as fast as any series."""
+    """Exact range by the square root: the default, as fast as any series.
+
+    >>> from torchsar import Draws, radar, scene
+    >>> airborne = radar.BistaticRadar(10e9, radar.LinearFM(20e6, 5e-6), 24e6, 100.0, 100.0, 5000.0)
+    >>> target = scene.MovingPoints([10.0], [0.0], [0.0], [0.0]).movers(airborne, Draws(seed=1))
+    >>> time_s = airborne.pulse_axis(200).values()[::50]  # -1 s to 0.5 s
+    >>> scene.ExactRange().range_m(target, time_s, airborne)[1, :, 0].round(decimals=1).tolist()
+    [11.0, 5.2, 0.0, -4.7]
+    """
 
     def range_m(self, movers: Movers, time_s: Tensor, radar: BistaticRadar) -> Tensor:
         return movers.range_m[..., None, None, :] + movers.excess_m(time_s, radar)
@@ -132,6 +154,13 @@ class ExactRange(ReceiveRange):
 @dataclass(frozen=True)
 class TaylorRange(ReceiveRange):
     """Power series of the range to the receiver about the closest range.
+
+    >>> from torchsar import Draws, radar, scene
+    >>> airborne = radar.BistaticRadar(10e9, radar.LinearFM(20e6, 5e-6), 24e6, 100.0, 100.0, 5000.0)
+    >>> target = scene.MovingPoints([0.0], [0.0], [0.0], [0.0]).movers(airborne, Draws(seed=1))
+    >>> time_s, orders = airborne.pulse_axis(600).values(), map(scene.TaylorRange, (2, 4))
+    >>> [round(float(m.neglected_phase_rad(target, time_s, airborne)), 1) for m in orders]
+    [1.7, 0.0]
 
     For the range R_m to channel m and the closest range R0 the series is
     R_m - R0 = R0 (x / 2 - x^2 / 8 + ...) with x = R_m^2 / R0^2 - 1. The same series holds for the
@@ -194,6 +223,12 @@ class TransmitRange(Protocol):
 class PolynomialTransmit(TransmitRange):
     """Polynomial range from the transmitter, R_T(t) - R_T(0) = k1 t + k2 t^2 + ...
 
+    >>> import torch
+    >>> from torchsar import scene
+    >>> time_s = torch.tensor([0.0, 1.0, 2.0], dtype=torch.float64)
+    >>> scene.PolynomialTransmit([100.0, 2.0]).range_m(time_s).tolist()
+    [0.0, 102.0, 208.0]
+
     Args:
         coefficients: k1, k2, ... in m/s, m/s^2, ...; each a number or one value per trial.
         order: Number of terms that are used, all by default.
@@ -238,6 +273,12 @@ class PolynomialTransmit(TransmitRange):
 class OrbitTransmit(TransmitRange):
     """Exact range from a satellite to a point of the scene that rotates with the Earth.
 
+    >>> import torch
+    >>> from torchsar import radar, scene
+    >>> overhead = scene.OrbitTransmit(radar.Orbit(7000e3), point_m=(6371e3, 0.0, 0.0))
+    >>> overhead.range_m(torch.tensor([0.0, 10.0, 20.0], dtype=torch.float64)).round().tolist()
+    [0.0, 3571.0, 14165.0]
+
     Args:
         orbit: Orbit of the satellite.
         point_m: Position of the point at the time `epoch_s`: three coordinates in the inertial
@@ -266,6 +307,13 @@ class OrbitTransmit(TransmitRange):
 @finite_numbers()
 class BistaticWorld:
     """Moving targets, their receive gain, the sea beneath them and the noise.
+
+    >>> from torchsar import Draws, echo, radar, scene
+    >>> airborne = radar.BistaticRadar(10e9, radar.LinearFM(20e6, 5e-6), 24e6, 100.0, 100.0, 5000.0)
+    >>> ship = scene.Ship(u_r_m_s=5.0, u_a_m_s=0.0)
+    >>> world = scene.BistaticWorld(ship, scene.BandLimited(duration_s=0.5), snr_db=20.0)
+    >>> echo.simulate_bistatic(airborne, world, 64, 32, Draws(seed=1))[0].signal.data.shape
+    torch.Size([3, 64, 32])
 
     Args:
         scene: Moving targets, None for none.

@@ -47,6 +47,12 @@ class NominalPath(Protocol):
 class StraightPath(NominalPath):
     """Straight path of constant speed; a speed of zero is a fixed antenna.
 
+    >>> import torch
+    >>> from torchsar import scene
+    >>> path = scene.StraightPath(start_m=(-1000.0, -50.0, 500.0), velocity_m_s=(0.0, 50.0, 0.0))
+    >>> path.position_m(torch.tensor([0.0, 1.0], dtype=torch.float64)).tolist()
+    [[-1000.0, -50.0, 500.0], [-1000.0, 0.0, 500.0]]
+
     Args:
         start_m: Position at the first pulse in metres (x, y, z).
         velocity_m_s: Velocity in m/s (x, y, z).
@@ -74,6 +80,12 @@ class StraightPath(NominalPath):
 @finite_numbers("a circular path", radius_m=0.0)
 class CircularPath(NominalPath):
     """Horizontal circle about the vertical axis through the origin, at constant speed.
+
+    >>> import torch
+    >>> from torchsar import scene
+    >>> circle = scene.CircularPath(1000.0, height_m=500.0, start_rad=0.0, rate_rad_s=0.1)
+    >>> circle.position_m(torch.tensor([0.0, 10.0], dtype=torch.float64)).round().tolist()
+    [[1000.0, 0.0, 500.0], [540.0, 841.0, 500.0]]
 
     The azimuth is counted from axis x towards y.
 
@@ -103,6 +115,11 @@ class CircularPath(NominalPath):
 class Offset(Motion):
     """Constant displacement.
 
+    >>> import torch
+    >>> from torchsar import scene
+    >>> scene.Offset(0.5).displacement_m(torch.tensor([0.0, 1.0])).tolist()
+    [0.5, 0.5]
+
     Args:
         metres: Displacement in metres.
 
@@ -120,6 +137,12 @@ class Offset(Motion):
 @finite_numbers("jitter", rms_m=0.0, step_s="positive")
 class Jitter(RandomMotion):
     """Independent normally distributed displacements at equal steps, with a spline between them.
+
+    >>> import torch
+    >>> from torchsar import Draws, scene
+    >>> drawn = scene.Jitter(rms_m=0.02, step_s=0.01).drawn(Draws(seed=1), span_s=10.0)
+    >>> round(float(drawn.displacement_m(torch.arange(0, 10, 0.01, dtype=torch.float64)).std()), 2)
+    0.02
 
     With the pulse interval as step, every pulse has its own displacement.
 
@@ -144,6 +167,12 @@ class Jitter(RandomMotion):
 @finite_numbers("a random walk", m_per_root_s=0.0, step_s="positive")
 class RandomWalk(RandomMotion):
     """Sum of independent normally distributed steps, zero at the first pulse.
+
+    >>> import torch
+    >>> from torchsar import Draws, scene
+    >>> drawn = scene.RandomWalk(0.1, step_s=0.1).drawn(Draws(1, trials=range(400)), span_s=4.0)
+    >>> drawn.displacement_m(torch.tensor([0.0, 4.0])).std(0).round(decimals=1).tolist()
+    [0.0, 0.2]
 
     Its standard deviation at the time t is `m_per_root_s` sqrt(t). About the mean of a recording of
     length T, its rms value is `m_per_root_s` sqrt(T / 6).
@@ -170,6 +199,12 @@ class RandomWalk(RandomMotion):
 @dataclass(frozen=True)
 class Sway:
     """Displacements in three axes, each a sum of motions.
+
+    >>> import torch
+    >>> from torchsar import scene
+    >>> sway = scene.Sway(y=[scene.Polynomial([0.1])], z=[scene.Offset(0.5)])
+    >>> sway.displacement_m(torch.tensor([0.0, 10.0], dtype=torch.float64)).tolist()
+    [[0.0, 0.0, 0.5], [0.0, 1.0, 0.5]]
 
     Args:
         x: Motions along axis x; an empty sequence for none.
@@ -224,6 +259,13 @@ class Sway:
 class Flight:
     """True path of an antenna: a nominal path and what it deviates by.
 
+    >>> import torch
+    >>> from torchsar import scene
+    >>> path = scene.StraightPath(start_m=(-1000.0, -50.0, 500.0), velocity_m_s=(0.0, 50.0, 0.0))
+    >>> flight = scene.Flight(path, scene.Sway(z=[scene.Polynomial([0.5])]))  # it climbs
+    >>> flight.position_m(torch.tensor([0.0, 1.0], dtype=torch.float64)).tolist()
+    [[-1000.0, -50.0, 500.0], [-1000.0, 0.0, 500.5]]
+
     Args:
         nominal: Nominal path.
         motion: Deviation from it.
@@ -263,6 +305,13 @@ class Flight:
 @finite_numbers("a navigation", latency_s=None, step_m=0.0, rate_hz=1 / _LONGEST_S)
 class Navigation:
     """What navigation records of a flight: late positions with errors, in whole steps.
+
+    >>> import torch
+    >>> from torchsar import Draws, scene
+    >>> path = scene.StraightPath(start_m=(-1000.0, -50.0, 500.0), velocity_m_s=(0.0, 50.0, 0.0))
+    >>> late = scene.Navigation(scene.Sway(z=[scene.Offset(0.5)]), latency_s=0.25)
+    >>> late.recorded_m(Draws(seed=1), torch.tensor([0.0, 1.0], dtype=torch.float64), path).tolist()
+    [[-1000.0, -62.5, 500.5], [-1000.0, -12.5, 500.5]]
 
     Args:
         error: Errors that are added, such as `Offset` (bias), `Polynomial` (drift), `RandomWalk`.

@@ -145,6 +145,12 @@ class _PowerLaw:
 class VibrationSpectrum(_PowerLaw):
     """Random vibration whose power spectral density follows a power of the frequency.
 
+    >>> import torch
+    >>> from torchsar import Draws, scene
+    >>> drawn = scene.VibrationSpectrum(1e-6, 10.0, 100.0).drawn(Draws(seed=1), span_s=10.0)
+    >>> round(1e6 * float(drawn.displacement_m(torch.arange(0, 10, 1e-3)).std()), 1)
+    1.0
+
     The motion is a sum of sinusoids with random phases. Their frequencies are spaced evenly in the
     logarithm, and each has the power of its part of the band, so that every trial has the same rms
     value over a long time. Equal limits give a single frequency.
@@ -171,6 +177,11 @@ class VibrationSpectrum(_PowerLaw):
 class PathFluctuation(VibrationSpectrum):
     """Fluctuation of the optical path by turbulent air.
 
+    >>> from torchsar import Draws, scene
+    >>> drawn = scene.PathFluctuation(rms_m=1e-6).drawn(Draws(seed=1), span_s=1.0)
+    >>> drawn.frequency_hz[[0, -1]].round().tolist()
+    [1.0, 1885.0]
+
     By default the power spectral density follows f^(-8/3), as for a point receiver in Kolmogorov
     turbulence. The displacement is added to the range, that is, to the mean of the paths to and
     from the target. The motion is a sum of sinusoids as in `VibrationSpectrum`.
@@ -196,6 +207,12 @@ class PathFluctuation(VibrationSpectrum):
 @finite_numbers("a log-amplitude", rms=0.0, lowest_hz=None, highest_hz=None, slope=None)
 class LogAmplitude(_PowerLaw):
     """Scintillation: the echo amplitude is multiplied by exp(chi(t)), equally for all scatterers.
+
+    >>> import torch
+    >>> from torchsar import Draws, scene
+    >>> drawn = scene.LogAmplitude(rms=0.2, lowest_hz=1.0).drawn(Draws(seed=1), span_s=10.0)
+    >>> round(float(drawn.value(torch.arange(0, 10, 0.01)).std()), 1)
+    0.2
 
     By default the power spectral density of the log-amplitude chi follows f^(-5/3).
 
@@ -262,6 +279,13 @@ def random_tones(
 @dataclass(frozen=True)
 class MeasuredTrack(Motion):
     """Measured displacement at equally spaced times, interpolated by a cubic spline.
+
+    >>> import torch
+    >>> from torchsar import scene
+    >>> time_s = torch.tensor([0.0, 1.0, 2.0], dtype=torch.float64)
+    >>> track = scene.MeasuredTrack(time_s, displacement=time_s / 1000)
+    >>> round(float(track.displacement_m(torch.tensor(0.5, dtype=torch.float64))), 6)
+    0.0005
 
     Args:
         time_s: Times from the start of the recording in seconds, shape (n,), shared by all trials;

@@ -38,6 +38,12 @@ class SweepError(Protocol):
 class CalibrationFibre:
     """Internal channel that mixes the sweep with a copy of itself from a fibre of known delay.
 
+    >>> from torchsar import radar, scene
+    >>> ladar = radar.TriangularLadar(193e12, 10e9, 1e-3, 256e3, 40.0, reference_range_m=1e3)
+    >>> fibre = scene.CalibrationFibre(delay_s=1e-9)
+    >>> round(ladar.chirp_rate_hz_s * fibre.delay_s)  # beat frequency in Hz
+    20000
+
     Args:
         delay_s: Delay of the fibre in seconds.
         snr_db: Signal-to-noise ratio per sample in decibels, None for no noise.
@@ -57,6 +63,13 @@ class CalibrationFibre:
 @finite_numbers(gate_m=None)
 class LadarWorld:
     """Scene, motion, propagation, laser errors and noise of a ladar acquisition.
+
+    >>> from torchsar import Draws, echo, radar, scene
+    >>> ladar = radar.TriangularLadar(193e12, 10e9, 1e-3, 256e3, 40.0, reference_range_m=1e3)
+    >>> world = scene.LadarWorld(scene.LetterE(), motion=[scene.Polynomial([0.01])], snr_db=10.0)
+    >>> recording, truth = echo.simulate_ladar(ladar, world, n_period=3, draws=Draws(seed=1))
+    >>> recording.signal.data.shape, truth.values["velocity_m_s"].round(decimals=3).tolist()
+    (torch.Size([2, 3, 128]), [0.01, 0.01, 0.01])
 
     An effect that is None is not simulated.
 

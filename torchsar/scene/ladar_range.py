@@ -248,6 +248,13 @@ class Fidelity:
 class EverySample(Fidelity):
     """Range evaluated at every sample: the exact model, and the slowest.
 
+    >>> from torchsar import radar, scene
+    >>> from torchsar.scene.ladar_range import Extremes
+    >>> ladar = radar.TriangularLadar(193e12, 10e9, 1e-3, 256e3, 40.0, reference_range_m=1e3)
+    >>> model = scene.EverySample(without=("hyperbola",))
+    >>> round(model.neglected_phase_rad(ladar, Extremes(across_m=5.0))["hyperbola"], 2)
+    0.63
+
     Args:
         without: Effects that are omitted, a tuple of "residual_video", "hyperbola" and "flight".
 
@@ -259,6 +266,13 @@ class EverySample(Fidelity):
 @dataclass(frozen=True)
 class QuadraticInSweep(Fidelity):
     """Quadratic phase of each scatterer in each sweep, with one curvature for all scatterers.
+
+    >>> from torchsar import radar, scene
+    >>> from torchsar.scene.ladar_range import Extremes
+    >>> ladar = radar.TriangularLadar(193e12, 10e9, 1e-3, 256e3, 40.0, reference_range_m=1e3)
+    >>> largest = Extremes(jerk_m_s3=1e4)
+    >>> round(scene.QuadraticInSweep().neglected_phase_rad(ladar, largest)["level"], 1)
+    0.1
 
     The curvature accounts for the acceleration and for the change of the Doppler shift across the
     band. For many scatterers the model takes little longer than `LinearInSweep`. It neglects the
@@ -287,6 +301,13 @@ class QuadraticInSweep(Fidelity):
 class LinearInSweep(Fidelity):
     """Linear phase of each scatterer in each sweep: the range follows a straight line. The default.
 
+    >>> from torchsar import radar, scene
+    >>> from torchsar.scene.ladar_range import Extremes
+    >>> ladar = radar.TriangularLadar(193e12, 10e9, 1e-3, 256e3, 40.0, reference_range_m=1e3)
+    >>> largest = Extremes(acceleration_m_s2=0.5)
+    >>> round(scene.LinearInSweep().neglected_phase_rad(ladar, largest)["level"], 1)
+    0.1
+
     The model neglects the acceleration and the change of the Doppler shift across the band; see
     `neglected_phase_rad`. `QuadraticInSweep` and `EverySample` are more exact.
 
@@ -309,6 +330,13 @@ class LinearInSweep(Fidelity):
 @dataclass(frozen=True)
 class OnePerSweep(Fidelity):
     """Stop-and-go approximation: the range is constant during each sweep.
+
+    >>> from torchsar import radar, scene
+    >>> from torchsar.scene.ladar_range import Extremes
+    >>> ladar = radar.TriangularLadar(193e12, 10e9, 1e-3, 256e3, 40.0, reference_range_m=1e3)
+    >>> largest = Extremes(velocity_m_s=0.001)
+    >>> round(scene.OnePerSweep().neglected_phase_rad(ladar, largest)["level"], 1)
+    2.0
 
     There is no Doppler shift within a sweep, so that methods that measure the velocity within
     sweeps find none. For comparisons only.
@@ -333,6 +361,13 @@ class OnePerSweep(Fidelity):
 @dataclass(frozen=True)
 class OnePerPeriod(OnePerSweep):
     """Stop-and-go approximation by period, with the range at the turning point for both sweeps.
+
+    >>> from torchsar import radar, scene
+    >>> from torchsar.scene.ladar_range import Extremes
+    >>> ladar = radar.TriangularLadar(193e12, 10e9, 1e-3, 256e3, 40.0, reference_range_m=1e3)
+    >>> largest = Extremes(velocity_m_s=0.001)
+    >>> round(scene.OnePerPeriod().neglected_phase_rad(ladar, largest)["level"], 1)
+    4.0
 
     For comparisons only.
 

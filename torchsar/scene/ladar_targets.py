@@ -18,6 +18,11 @@ from torchsar.scene.trials import finite, finite_numbers, refuse_unless, with_di
 class LetterE(Scene):
     """Letter E of 62 points of amplitude 1.
 
+    >>> from torchsar import Draws, scene
+    >>> points = scene.LetterE().scatterers(Draws(seed=1))
+    >>> len(points.amplitude), round(float(points.range_m.max()), 2)
+    (62, 0.4)
+
     A spine of 17 points lies along range, 5 cm apart. Three arms of 15 points each lie along
     azimuth, 1 cm apart, at the points 0, 8 and 16 of the spine; they begin 1 cm beside it, towards
     positive azimuth. The publication shows the letter without coordinates; the layout is chosen
@@ -58,6 +63,11 @@ class LetterE(Scene):
 @finite_numbers("a retro-reflector with a line", line_m=None)
 class RetroAndBrokenLine(Scene):
     """Retro-reflector, and behind it a broken line of 9 points with random phases.
+
+    >>> from torchsar import Draws, scene
+    >>> points = scene.RetroAndBrokenLine(retro_db=20.0, line_db=-20.0).scatterers(Draws(seed=1))
+    >>> points.amplitude.abs().round(decimals=2)[:3].tolist()
+    [10.0, 1.0, 1.0]
 
     The target stands in for that of the ground experiment, whose layout is not published. The
     retro-reflector has the amplitude 10^(retro_db / 20); with a world of snr_db = 0 its

@@ -238,6 +238,12 @@ def _numbers(values: Numbers) -> Tensor:
 class MovingPoints(MovingScene):
     """Points with given positions, in uniform motion.
 
+    >>> from torchsar import Draws, radar, scene
+    >>> airborne = radar.BistaticRadar(10e9, radar.LinearFM(20e6, 5e-6), 24e6, 100.0, 100.0, 5000.0)
+    >>> pair = scene.MovingPoints([5.0, 0.0], [0.0, 0.0], azimuth_m=[0.0, 0.0], range_m=[0.0, 30.0])
+    >>> pair.movers(airborne, Draws(seed=1)).closest_m(airborne).tolist()
+    [5000.0, 5030.0]
+
     Each parameter is a list with one entry per target (numbers, or one value per trial) or a tensor
     of shape (..., target), which may require gradients.
 
@@ -284,6 +290,12 @@ class MovingPoints(MovingScene):
 @finite_numbers("a ship", length_m=0.0, cell_m=0.0)
 class Ship(MovingScene):
     """Extended target: scatterers of common motion at random positions along track.
+
+    >>> from torchsar import Draws, radar, scene
+    >>> airborne = radar.BistaticRadar(10e9, radar.LinearFM(20e6, 5e-6), 24e6, 100.0, 100.0, 5000.0)
+    >>> ship = scene.Ship(u_r_m_s=5.0, u_a_m_s=0.0, range_cells=3, count=6)
+    >>> ship.movers(airborne, Draws(seed=1)).range_m.tolist()
+    [-6.0, 0.0, 6.0, -6.0, 0.0, 6.0]
 
     The scatterers are dealt out to several range cells in turn. All scatterers have the same
     amplitude; each trial draws their along-track positions and phases.
@@ -339,6 +351,12 @@ class Ship(MovingScene):
 @dataclass(frozen=True)
 class GroundMovers(MovingScene):
     """Points that move on flat ground, followed exactly in three dimensions.
+
+    >>> from torchsar import Draws, radar, scene
+    >>> airborne = radar.BistaticRadar(10e9, radar.LinearFM(20e6, 5e-6), 24e6, 100.0, 100.0, 5000.0)
+    >>> car = scene.GroundMovers([10.0], [0.0], azimuth_m=[0.0], ground_range_m=[4000.0])
+    >>> car.movers(airborne, Draws(seed=1)).u_r_m_s.tolist()  # of a receiver 3000 m high
+    [-8.0]
 
     The ground lies the height h = radar.height_m below the track of the receiver. At slow time t, a
     point with the ground range g, the outward speed w and the outward acceleration a (all at t = 0)
@@ -406,6 +424,12 @@ class GroundMovers(MovingScene):
 @dataclass(frozen=True)
 class Fleet(MovingScene):
     """Several moving scenes in one.
+
+    >>> from torchsar import Draws, radar, scene
+    >>> airborne = radar.BistaticRadar(10e9, radar.LinearFM(20e6, 5e-6), 24e6, 100.0, 100.0, 5000.0)
+    >>> ship, boat = scene.Ship(5.0, 0.0, count=15), scene.MovingPoints([3.0], [0.0], [50.0], [0.0])
+    >>> scene.Fleet({"ship": ship, "boat": boat}).movers(airborne, Draws(seed=1)).u_r_m_s.shape
+    torch.Size([16])
 
     Args:
         parts: Scenes by name; the random numbers of each scene depend on its name.

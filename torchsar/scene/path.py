@@ -36,6 +36,12 @@ class Ground(Protocol):
 class PlaneGround(Ground):
     """Plane z = height + slope_x x + slope_y y.
 
+    >>> import torch
+    >>> from torchsar import scene
+    >>> x_m = torch.tensor([0.0, 100.0], dtype=torch.float64)
+    >>> scene.PlaneGround(level_m=10.0, slope_x=0.25).height_m(x_m, torch.zeros_like(x_m)).tolist()
+    [10.0, 35.0]
+
     Args:
         level_m: Height at x = y = 0 in metres.
         slope_x: Slope along x in metres per metre.
@@ -58,6 +64,12 @@ class PlaneGround(Ground):
 @finite_numbers("a beam", width_deg=None)
 class SideBeam:
     """Beam of a uniform aperture along the heading, with pointing errors.
+
+    >>> import torch
+    >>> from torchsar import scene
+    >>> ahead = torch.deg2rad(torch.tensor([[-5.0, 0.0, 5.0]])).sin()
+    >>> scene.SideBeam(width_deg=10.0).gain(torch.zeros(1), ahead).square()  # power
+    tensor([[0.5000, 1.0000, 0.5000]], dtype=torch.float64)
 
     The one-way amplitude gain is sinc(x), where x is proportional to the difference between the
     sines of two angles ahead of broadside: that of the line of sight, and that of the beam centre,
@@ -124,6 +136,13 @@ class SideBeam:
 @finite_numbers(window_range_m=0.0)
 class PathWorld:
     """Scene seen from any path, by one antenna or by a transmitter and a receiver.
+
+    >>> from torchsar import Draws, echo, radar, scene
+    >>> imager = radar.InverseRadar(carrier_hz=10e9, bandwidth_hz=150e6, prf_hz=100.0)
+    >>> flight = scene.Flight(scene.StraightPath((-1000.0, -16.0, 500.0), (0.0, 50.0, 0.0)))
+    >>> world = scene.PathWorld(scene.Points([0.0], [0.0]), flight, snr_db=10.0)
+    >>> echo.simulate_path(imager, world, 64, 16, Draws(seed=1))[0].signal.data.shape
+    torch.Size([64, 16])
 
     A scatterer lies at x = range, y = azimuth, z = height of the ground. The middle of the range
     window, to which phases refer, follows the point (0, 0, 0) as navigation sees it, or has a

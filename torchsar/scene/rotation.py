@@ -23,6 +23,12 @@ from torchsar.scene.trials import finite_numbers, refuse_unless_finite
 class PolynomialRotation:
     """Rotation with a polynomial angle, theta(t) = omega (t + k1 t^2 / 2! + k2 t^3 / 3! + ...).
 
+    >>> import torch
+    >>> from torchsar import scene
+    >>> time_s = torch.tensor([0.0, 2.5, 5.0], dtype=torch.float64)
+    >>> scene.PolynomialRotation(omega_rad_s=0.1, k=[0.2]).rate(time_s).round(decimals=3).tolist()
+    [0.1, 0.15, 0.2]
+
     The time t and the angle theta are zero at the FIRST pulse. The uniform rotation that
     `TurntableWorld.rotation_rad_s` gives is different: its angle is zero at the middle pulse. A
     simulation rejects a rotation whose rate falls to zero; see `refuse_turning_back`.

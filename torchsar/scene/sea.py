@@ -126,6 +126,13 @@ def _entries(table: Tensor, index: Tensor, dim: int) -> Tensor:
 class KSea(Sea):
     """K-distributed clutter: speckle with a gamma-distributed texture.
 
+    >>> import torch
+    >>> from torchsar import Draws, scene
+    >>> grid_m, sea = torch.arange(-100.0, 100.0), scene.KSea(shape=2.0, cell_m=(1.0, 1.0))
+    >>> intensity = sea.reflectivity(grid_m, grid_m, Draws(seed=1)).abs().square()
+    >>> round(float(intensity.square().mean() / intensity.mean().square()))
+    3
+
     The intensity I satisfies <I^2> / <I>^2 = 2 (1 + 1 / shape). An image shows the K distribution
     where it resolves the texture cells.
 
@@ -188,6 +195,13 @@ class KSea(Sea):
 @finite_numbers("an image", azimuth_extent_m="positive", range_extent_m="positive")
 class ImageReflectivity(Sea):
     """Surface whose mean intensity is a given image; each trial draws its own speckle.
+
+    >>> import torch
+    >>> from torchsar import Draws, scene
+    >>> coast = scene.ImageReflectivity([[0.0, 1.0]], azimuth_extent_m=100.0, range_extent_m=100.0)
+    >>> line_m = torch.tensor([-25.0, 25.0], dtype=torch.float64)
+    >>> coast.texture(line_m[:1], line_m, Draws(seed=1))[0].tolist()
+    [[0.0, 2.0]]
 
     A cell of the simulation grid takes the value of the pixel in which it lies. Beyond the edges of
     the image its mirror image follows. The echo is differentiable in the intensity.

@@ -48,6 +48,12 @@ class Path(Protocol):
 class Hyperbola(Path):
     """Exact range history of a straight path, r(t) = sqrt(r0^2 + v^2 t^2), constant during a pulse.
 
+    >>> import torch
+    >>> from torchsar import scene
+    >>> since_s = torch.tensor([-30.0, 0.0, 30.0])
+    >>> scene.Hyperbola().range_m(since_s, torch.tensor(4000.0), torch.tensor(100.0)).tolist()
+    [5000.0, 4000.0, 5000.0]
+
     The history neglects the motion within the pulse. The Doppler shift, which this motion causes,
     would displace the echo of a chirp in range and change its phase.
     """
@@ -77,6 +83,12 @@ class Hyperbola(Path):
 @dataclass(frozen=True)
 class Parabola(Path):
     """Second-order range history, r(t) = r0 + v^2 t^2 / (2 r0).
+
+    >>> import torch
+    >>> from torchsar import scene
+    >>> since_s = torch.tensor([-30.0, 0.0, 30.0])
+    >>> scene.Parabola().range_m(since_s, torch.tensor(4000.0), torch.tensor(100.0)).tolist()
+    [5125.0, 4000.0, 5125.0]
 
     This range history neglects the terms of the hyperbola from t^4 on; see `neglected_phase_rad`.
 
@@ -152,7 +164,14 @@ class Beam(Protocol):
 
 @dataclass(frozen=True)
 class AlwaysLit(Beam):
-    """Beam that illuminates every target in every pulse."""
+    """Beam that illuminates every target in every pulse.
+
+    >>> import torch
+    >>> from torchsar import scene
+    >>> since_s = torch.tensor([[-1.0], [0.0], [1.0]])  # pulses, one target
+    >>> scene.AlwaysLit().weight(since_s, 25 * since_s, torch.tensor(50.0))[:, 0]
+    tensor([1., 1., 1.])
+    """
 
     def weight(self, since_s: Tensor, doppler_offset_hz: Tensor, velocity_m_s: Tensor) -> Tensor:
         return torch.ones_like(since_s)
@@ -162,6 +181,12 @@ class AlwaysLit(Beam):
 @finite_numbers(dwell_s="positive")
 class Dwell(Beam):
     """Beam of constant gain and limited dwell time.
+
+    >>> import torch
+    >>> from torchsar import scene
+    >>> since_s = torch.tensor([[-1.0], [0.0], [1.0]])  # pulses, one target
+    >>> scene.Dwell(dwell_s=1.5).weight(since_s, 25 * since_s, torch.tensor(50.0))[:, 0]
+    tensor([0., 1., 0.])
 
     Args:
         dwell_s: Time for which a target is illuminated, centred on its crossing of the beam centre,
@@ -185,6 +210,12 @@ class Dwell(Beam):
 class Antenna(Beam):
     """Beam of a uniform aperture, side lobes included.
 
+    >>> import torch
+    >>> from torchsar import scene
+    >>> since_s = torch.tensor([[-1.0], [0.0], [1.0]])  # pulses, one target
+    >>> scene.Antenna(length_m=2.0).weight(since_s, 25 * since_s, torch.tensor(50.0))[:, 0]
+    tensor([0.4053, 1.0000, 0.4053])
+
     The two-way amplitude gain is sinc^2(length_m f / (2 v)) at the Doppler frequency f relative to
     the beam centre, with the velocity v and sinc(x) = sin(pi x) / (pi x).
 
@@ -204,7 +235,14 @@ class Antenna(Beam):
 @dataclass(frozen=True)
 @finite_numbers()
 class StripmapWorld:
-    """Scene seen from a straight path.
+    """Scene seen from a straight path, with its illumination, true motion of the radar and noise.
+
+    >>> from torchsar import Draws, echo, radar, scene
+    >>> sensor = radar.StripmapRadar(3.2e9, radar.LinearFM(40e6, 5e-7), 50e6, 400.0, 120.0, 4000.0)
+    >>> world = scene.StripmapWorld(scene.Points([0.0], [0.0]), scene.Dwell(0.1), doppler_hz=25.0)
+    >>> recording, truth = echo.simulate(sensor, world, n_pulse=64, n_range=128, draws=Draws(1))
+    >>> recording.signal.data.shape, float(truth.values["doppler_hz"])
+    (torch.Size([64, 128]), 25.0)
 
     Args:
         scene: Scatterers.

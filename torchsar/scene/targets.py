@@ -26,6 +26,13 @@ from torchsar.scene.trials import (
 class Scatterers:
     """Point scatterers, relative to the middle of the recorded frame.
 
+    >>> import torch
+    >>> from torchsar import scene
+    >>> place_m = torch.tensor([0.0, 5.0], dtype=torch.float64)
+    >>> points = scene.Scatterers(place_m, place_m, amplitude=torch.tensor([1.0, 0.5j]))
+    >>> points.amplitude.abs().tolist()
+    [1.0, 0.5]
+
     The leading dimensions are trials. Tensors may require gradients.
 
     Args:
@@ -77,7 +84,15 @@ def unit_phases(turns: Tensor) -> Tensor:
 
 
 class Scene(Protocol):
-    """Scene that gives scatterers."""
+    """Scene of point scatterers: the protocol that every scene of this package follows.
+
+    >>> from torchsar import Draws, scene
+    >>> class Corner(scene.Scene):
+    ...     def scatterers(self, draws):
+    ...         return scene.Points([0.0, 0.0, 1.0], [0.0, 1.0, 0.0]).scatterers(draws)
+    >>> Corner().scatterers(Draws(seed=1)).range_m.tolist()
+    [0.0, 1.0, 0.0]
+    """
 
     def scatterers(self, draws: Draws) -> Scatterers:
         """Draw the scatterers.
@@ -94,7 +109,12 @@ class Scene(Protocol):
 @dataclass(frozen=True)
 @finite_numbers("points")
 class Points(Scene):
-    """Given points.
+    """Point scatterers at given positions, with given amplitudes.
+
+    >>> from torchsar import Draws, scene
+    >>> pair = scene.Points(azimuth_m=[0.0, 12.0], range_m=[0.0, 40.0], amplitude=[1.0, 0.5])
+    >>> pair.scatterers(Draws(seed=1)).amplitude.tolist()
+    [(1+0j), (0.5+0j)]
 
     Every parameter is a list with one entry per target; each entry is a number or one value per
     trial.
@@ -164,6 +184,12 @@ class _Rectangle(Scene):
 class RandomPoints(_Rectangle):
     """Points at random positions in a rectangle, with random powers and phases.
 
+    >>> from torchsar import Draws, scene
+    >>> points = scene.RandomPoints(100, azimuth_extent_m=10.0, range_extent_m=20.0)
+    >>> drawn = points.scatterers(Draws(seed=1, trials=range(3)))
+    >>> drawn.range_m.shape, bool(drawn.range_m.abs().max() <= 10)
+    (torch.Size([3, 100]), True)
+
     Args:
         count: Number of scatterers, fixed for all trials.
         azimuth_extent_m: Azimuth side of the rectangle in metres.
@@ -190,6 +216,11 @@ class RandomPoints(_Rectangle):
 @dataclass(frozen=True)
 class Speckle(_Rectangle):
     """Rectangle of fully developed speckle: circular Gaussian scatterers at random positions.
+
+    >>> from torchsar import Draws, scene
+    >>> field = scene.Speckle(1000, azimuth_extent_m=10.0, range_extent_m=20.0, level_db=20.0)
+    >>> round(float(field.scatterers(Draws(seed=1)).amplitude.abs().square().sum()), -1)
+    100.0
 
     About three scatterers or more per resolution cell are needed for the statistics of clutter.
 
@@ -221,6 +252,12 @@ class Speckle(_Rectangle):
 @dataclass(frozen=True)
 class Together(Scene):
     """Several scenes in one.
+
+    >>> from torchsar import Draws, scene
+    >>> ground = scene.Speckle(100, azimuth_extent_m=10.0, range_extent_m=20.0)
+    >>> both = scene.Together({"ground": ground, "target": scene.Points([0.0], [0.0])})
+    >>> both.scatterers(Draws(seed=1)).amplitude.shape
+    torch.Size([101])
 
     Args:
         parts: Scenes by name. The name of a scene decides which random numbers it draws.

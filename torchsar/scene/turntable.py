@@ -20,6 +20,11 @@ from torchsar.scene.vibration import Motion, PulsePhase, displacement_m
 class PhaseOnly:
     """Range-compressed pulses with fixed envelopes, in which only the phases change.
 
+    >>> from torchsar import radar, scene
+    >>> imager = radar.InverseRadar(10e9, 150e6, 100.0, rotation_rad_s=0.05, pulse_s=1e-4)
+    >>> round(scene.PhaseOnly().neglected_phase_rad(imager, 64, cross_range_m=1.0, range_m=1.0), 2)
+    0.05
+
     Rotation, motion and start phases act on the phases. The model is meant for studies of phase
     errors. It neglects migration of the envelopes, motion within the pulse, coupling of range and
     Doppler, and the residual video phase; see `neglected_phase_rad`. `Dechirped` is the more exact
@@ -126,6 +131,14 @@ class PhaseOnly:
 class Dechirped:
     """Dechirped pulses with the range evaluated at every sample.
 
+    >>> from torchsar import Draws, echo, radar, scene
+    >>> imager = radar.InverseRadar(10e9, 150e6, 100.0, rotation_rad_s=0.05, pulse_s=1e-4)
+    >>> target, motion = scene.Points([0.0], [0.0]), [scene.Polynomial([10.0])]
+    >>> world = scene.TurntableWorld(target, motion=motion, fidelity=scene.Dechirped(track=motion))
+    >>> recording, truth = echo.simulate_turntable(imager, world, 3, 32, Draws(seed=1))
+    >>> recording.aux["reference_m"].round(decimals=2).tolist()
+    [0.0, 0.1, 0.2]
+
     Rotation, translation and vibration continue during the pulse. The phase of a scatterer is
     -2 pi (f0 dtau + gamma t' dtau - gamma dtau^2 / 2), with the carrier f0, the chirp rate gamma,
     the delay dtau relative to the reference of the receiver and the time t' from the middle of the
@@ -189,6 +202,13 @@ Fidelity = PhaseOnly | Dechirped
 @finite_numbers()
 class TurntableWorld:
     """Scene that rotates while it moves along the line of sight.
+
+    >>> from torchsar import Draws, echo, radar, scene
+    >>> imager = radar.InverseRadar(10e9, 150e6, prf_hz=100.0, rotation_rad_s=0.05)
+    >>> world = scene.TurntableWorld(scene.Points([0.0, 2.0], [0.0, 3.0]), snr_db=10.0)
+    >>> recording, truth = echo.simulate_turntable(imager, world, 64, 32, Draws(1, trials=range(3)))
+    >>> recording.signal.data.shape, truth.values["range_m"].shape
+    (torch.Size([3, 64, 32]), torch.Size([2]))
 
     A uniform rotation has the angle theta = rotation_rad_s (t - t_mid), with the time t_mid of
     pulse n_pulse // 2.

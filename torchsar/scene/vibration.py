@@ -24,7 +24,16 @@ _NAME = re.compile(r"(\d+(?:\.\d+)?)_(\d+(?:\.\d+)?)_(-?\d+(?:\.\d+)?)")
 
 
 class Motion(Protocol):
-    """Displacement of the whole target along the line of sight."""
+    """Displacement of the whole target along the line of sight.
+
+    >>> import torch
+    >>> from torchsar import scene
+    >>> class Step(scene.Motion):
+    ...     def displacement_m(self, time_s):
+    ...         return 0.5 * (time_s > 1)
+    >>> Step().displacement_m(torch.tensor([0.5, 1.5])).tolist()
+    [0.0, 0.5]
+    """
 
     def displacement_m(self, time_s: Tensor) -> Tensor:
         """Return the displacement.
@@ -42,6 +51,12 @@ class Motion(Protocol):
 @finite_numbers("a vibration", frequency_hz=0.0)
 class Sinusoid(Motion):
     """Sinusoidal vibration, d(t) = A sin(2 pi f t + phase).
+
+    >>> import torch
+    >>> from torchsar import scene
+    >>> shake = scene.Sinusoid(amplitude_m=0.002, frequency_hz=0.25)
+    >>> shake.displacement_m(torch.tensor([0.0, 1.0], dtype=torch.float64)).tolist()
+    [0.0, 0.002]
 
     This SINE reproduces the results of the Reference. With a cosine, the vibration `1_0.1_90` of
     the Reference (amplitude 1, 0.1 Hz, 90 degrees) would be nearly linear in time and hardly
@@ -106,6 +121,12 @@ class Sinusoid(Motion):
 class Polynomial(Motion):
     """Translation d(t) = c1 t + c2 t^2 + ...
 
+    >>> import torch
+    >>> from torchsar import scene
+    >>> time_s = torch.tensor([0.0, 1.0, 2.0], dtype=torch.float64)
+    >>> scene.Polynomial([1.0, 0.5]).displacement_m(time_s).tolist()
+    [0.0, 1.5, 4.0]
+
     There is no constant term: the range window is centred on the initial position.
 
     Args:
@@ -168,6 +189,11 @@ class PulsePhase(Protocol):
 class StartPhase(PulsePhase):
     """Independent normally distributed phase of each pulse.
 
+    >>> from torchsar import Draws, scene
+    >>> phase_rad = scene.StartPhase(sigma_rad=0.5).phase_rad(Draws(seed=1), n_pulse=1000)
+    >>> phase_rad.shape, round(float(phase_rad.std()), 1)
+    (torch.Size([1000]), 0.5)
+
     Args:
         sigma_rad: Standard deviation in radians.
 
@@ -184,7 +210,13 @@ class StartPhase(PulsePhase):
 
 @dataclass(frozen=True)
 class UniformStartPhase(PulsePhase):
-    """Independent phase of each pulse, uniform in 0 to 2 pi: pulses are incoherent."""
+    """Independent phase of each pulse, uniform in 0 to 2 pi: pulses are incoherent.
+
+    >>> from torchsar import Draws, scene
+    >>> phase_rad = scene.UniformStartPhase().phase_rad(Draws(seed=1), n_pulse=1000)
+    >>> [round(float(bound), 1) for bound in phase_rad.aminmax()]
+    [0.0, 6.3]
+    """
 
     def phase_rad(self, draws: Draws, n_pulse: int) -> Tensor:
         return draws.uniform("scene.start_phase.uniform", (n_pulse,), 0.0, 2 * math.pi)
