@@ -1,4 +1,33 @@
-"""Estimators of motion, pointing and phase errors, and the stages that correct data with them."""
+"""Estimators of motion, pointing and phase errors, and the stages that correct data with them.
+
+=================================  ==============================================================
+to find or correct                 what to use
+=================================  ==============================================================
+Doppler centroid of a strip        `DopplerCentroid`; within one PRF `energy_centre`,
+                                   `phase_increment`
+Doppler from a known bright point  `PointDoppler`, `point_doppler`, `doppler_at`
+effective velocity of a strip      `EffectiveVelocity`, `minimum_entropy_velocity`
+phase of each pulse                `autofocus`; faster `sca`, `pga`, `pga_sca`; baselines
+                                   `entropy_fixed_point`, `sharpest_phase`
+phase, homogeneous scene           `link_phases`
+correction of the phase            `correct_pulse_phase`
+misaligned range profiles          `align_envelopes`, then `shift_range`
+non-uniform rotation of a target   `uneven_rotation`; its first step `coarse_rotation`; baselines
+                                   `entropy_rotation` and `chirplet_clean`
+phase, known non-uniform rotation  `rotation_autofocus`
+entropy as a function of rotation  `ImageEntropy`, with the settings `EntropyObjective`
+radial motion seen by a ladar      `radial_motion`, then `compensate_motion`; baselines
+                                   `segmented_interference`, `mirror_product`, `ml_peak`,
+                                   `spectrum_correlation`; range error at any time `range_error`
+residual phase after it            `phase_polish`
+amplitude of each pulse            `pulse_gain`, then `equalise_pulses`
+errors of a recorded path          `path_autofocus`, of a strip `strip_autofocus`, then
+                                   `CorrectPath`
+phase of each pulse on any path    `path_phase`
+=================================  ==============================================================
+
+Most functions are stages of chains, too: `Autofocus` calls `autofocus`, and so on.
+"""
 
 from torchsar.compensate.ambiguity import DopplerCentroid
 from torchsar.compensate.doppler import (

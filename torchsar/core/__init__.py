@@ -1,4 +1,31 @@
-"""Foundation of the package: axes, signals, chains, estimates, random draws and transforms."""
+"""Foundation of the package: axes, signals, chains, estimates, random draws and transforms.
+
+=======================================  ==========================================================
+data or task                             what to use
+=======================================  ==========================================================
+samples with named axes                  `Signal` and `Axis`; dimensions before the axes are trials
+record of an instrument                  `Recording`: the signal, the instrument and side data
+true values of a simulation              `Truth`
+processing step of your own              `Stage`
+several steps in order                   `Chain`; `use` passes a value to a later step; `Trace`
+                                         holds all results
+several effects, each estimated in turn  `Alternate` with one `Turn` for each
+result of an estimator                   `Estimate`; `Outcome` says whether it can be trusted,
+                                         `counts` and `worst` combine outcomes
+random numbers that can be repeated      `Draws`
+spectrum along an axis of a signal       `to_frequency` and `from_frequency`
+spectrum of a tensor                     `centred_fft` and `centred_ifft`
+exp(j phase)                             `cis` in radians, `unit_phasor` in turns, `linear_phasor`
+                                         for a linear phase
+phase without whole turns                `wrapped`, in turns `reduced_turns`
+smooth curve                             `Spline` through knots, `legendre` polynomials
+one value or index per trial             `per_trial` to broadcast it, `take` to select by it
+power, very large or small samples       `power_of`, `unit_level`, `level_of`
+checks in a function of your own         `checked_samples`, `refuse_non_finite`, `check_value`;
+                                         `gathered_checks` and `host_value` on an accelerator
+whether a device can compute             `device_fault`
+=======================================  ==========================================================
+"""
 
 from torchsar.core import trees as trees  # registers signals and estimates with torch
 from torchsar.core.alternate import Alternate, Turn

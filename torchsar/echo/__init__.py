@@ -1,5 +1,27 @@
 """Simulation of recordings and their true values, with noise and errors of the receiver.
 
+================================  ==================================================================
+to simulate                       what to use
+================================  ==================================================================
+strip                             `simulate`; `stripmap_echo` for the echo without noise
+rotating target                   `simulate_turntable`; `turntable_echo`, `dechirped_echo`
+triangular ladar                  `simulate_ladar` for sweeps, `simulate_ladar_record` for a
+                                  continuous record; `ladar_echo`
+moving targets, several channels  `simulate_bistatic`; `bistatic_echo`
+any path                          `simulate_path`; `path_echo`
+impairments of any recording      `apply_impairments`, each an `Impairment`
+lost or misnumbered lines         `LostLines`, `LostGaps`, `LostPulses`, `RepeatedLines`,
+                                  `CorruptedNumbers`
+interference, converter           `Tone`, `WideInterferer`, `Quantiser`, `PeriodicJitter`
+receiver of one channel           `ChannelResponse`, made by `smooth_response`
+receiver of several channels      `ChannelImbalance` for lines in turn, `ChannelErrors` for channels
+                                  along track
+clocks of a bistatic pair         `SynchronisationError`
+phase of each pulse               `WhitePhase`, `PhaseWalk`, `PhaseSinusoid`
+non-linear sweeps of a ladar      `PolynomialSweepError`, `SinusoidSweepError`
+errors of recorded positions      `PathError`
+================================  ==================================================================
+
 The functions take the description of the radar and a world: the scene, its motion and the noise. An
 impairment is called with a recording and random draws; it returns the impaired recording and the
 true values of the impairment. The recording may be simulated or recorded. A parameter annotated

@@ -1,4 +1,38 @@
-"""Range compression, image formation, and predictions of the errors of simplified processing."""
+"""Range compression, image formation, and predictions of the errors of simplified processing.
+
+=====================================  =============================================================
+data or task                           what to use
+=====================================  =============================================================
+raw strip, swath of moderate width     `omega_k`; many recordings of one geometry `StoredOmegaK`
+raw strip, wide swath or large squint  `omega_k_stolt`
+raw strip, baseline and reference      `range_doppler`; `backproject_strip`, exact, for patches
+strip longer than memory               `plan_strip`, `focus_strip`, `write_strip`; overlap
+                                       `reach_lines`
+strip: zero padding, other axes        `PaddedLines`; `closest_range`
+raw lines, range only                  `range_compress`
+dechirped pulses                       `compress_dechirped`
+rotating target                        `azimuth_transform`; from profiles `TargetImage`
+target with non-uniform rotation       `range_phase`, then `matched_fourier`
+                                       (`MatchedFourierOperator`)
+its image lines, its sums              `DopplerLines`, `CrossRangeLines`; `Gridding`,
+                                       `CompiledNufft`, `ExplicitSum`, `Resampling`
+sweeps of a triangular ladar           `compress_sweeps`, `deramp_azimuth`, `azimuth_matched_filter`
+any path                               `TileImage`; `DirectImage` and `backproject`, exact and slow;
+                                       base class `PathImage`
+any path, grid from its geometry       `SpotlightImage`
+any path, several histories            `TilePlan`; `image_tiles` for one history; pixels `ImageGrid`
+nearly straight path                   `OmegaKImage`; `compensated_omega_k`, `MotionCompensation`;
+                                       beam `ProcessedBeam`
+spotlight, small scene                 `PolarFormat`, `PolarOperator`; exact `backproject_spotlight`
+transforms                             `nufft_type1`, `nufft_type2`, `chirp_z`, `keystone`
+amplitude and pictures of an image     `amplitude`, `multilook`, `to_db`; `Detect`, `QuickLook`
+errors predicted before processing     `requirements`, `inverse_requirements`, `ladar_requirements`,
+                                       `ladar_limits`
+=====================================  =============================================================
+
+Most functions are stages of chains, too: `OmegaK` calls `omega_k`, and so on. `Backproject` calls
+`backproject_strip`, and `SpotlightBackprojection` calls `backproject_spotlight`.
+"""
 
 from torchsar.focus.backprojection import backproject
 from torchsar.focus.chirp_z import chirp_z, keystone

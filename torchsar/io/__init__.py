@@ -1,4 +1,20 @@
-"""Readers and writers of recorded radar data and of images."""
+"""Readers and writers of recorded radar data and of images.
+
+===================================  ========================================================
+file or task                         what to use
+===================================  ========================================================
+file of any of these formats         `read`; a phase history with its antennas `read_history`
+raw strip (.npz)                     `read_stripmap`
+rotating target or turntable (.npz)  `read_inverse`
+phase history on any path (.npz)     `read_path`
+CPHD, a phase history                `read_cphd`, `write_cphd`
+SICD, a complex image                `read_sicd`, `write_sicd`
+HDF5, MATLAB, numpy, flat binary     `import_recording`, which writes an .npz file
+images of a run (zarr)               `read_images`
+image for other programs             `write_geotiff`, `write_netcdf`
+strip longer than memory             `StripImage`, `write_strip_geotiff`
+===================================  ========================================================
+"""
 
 from torchsar.io.arrays import read_images
 from torchsar.io.cphd import read_cphd

@@ -1,4 +1,27 @@
-"""Image quality, errors of estimates, and Cramer-Rao bounds."""
+"""Image quality, errors of estimates, and Cramer-Rao bounds.
+
+=================================  =================================================================
+to judge                           what to use
+=================================  =================================================================
+sharpness of an image              `entropy`, `contrast`
+image against a reference          `error_db`; with a free gain `error_after_gain_db`, with a shift
+                                   `registered_error_db`; `correlation`
+response of a point                `impulse_response`; in an azimuth profile `azimuth_response`
+false targets of several channels  `replica_level` within `replica_zones`
+phases of pulses                   `phase_rmse`, `residual_phase`, `strehl`; bounds
+                                   `pulse_phase_bound_rad`, `pulse_phase_bound_of_scene_rad`
+errors over trials                 `trial_statistics`, with confidence intervals
+bound of a Doppler centroid        `beam_centre_bound_hz`, of a tone `tone_frequency_bound_hz`;
+                                   published curve `reference_doppler_std_hz`
+bound of the velocity of a strip   `velocity_bound_m_s`
+bounds of a moving point           `bistatic_bounds`
+bounds of a non-uniform rotation   `rotation_bounds`
+bound of a velocity by a ladar     `velocity_free_offset_bound_m_s`,
+                                   `velocity_known_offset_bound_m_s`, `velocity_segmented_bound_m_s`
+bound of a range by a ladar        `range_per_sweep_bound_m`, `integrated_range_detrended_bound_m`
+bound of the errors of a path      `line_of_sight_bound_m`
+=================================  =================================================================
+"""
 
 from torchsar.metrics.bistatic_bounds import bistatic_bounds
 from torchsar.metrics.bounds import (

@@ -3,6 +3,36 @@
 The receiver has several channels along track and a low pulse rate. The full Doppler spectrum of a
 stationary scene is reconstructed from the channels with zero velocity, that of a moving target with
 the velocity of the target.
+
+=================================  =================================================================
+task                               what to use
+=================================  =================================================================
+before data are processed          `multichannel_limits`, `multichannel_requirements` of a
+                                   `MultichannelUse`
+range compression, transmit range  `CompressChannels`; `remove_transmit_range`, as published
+                                   `AzimuthScaling`
+errors of channels and clocks      `estimate_balance`, `correct_balance`; `EstimateSynchronisation`,
+                                   `RemoveSynchronisation`
+image of a stationary scene        `stationary_image`
+scene and its moving targets       `MoversImage` in chains; `ImageMovers` of one recording gives a
+                                   `SceneImage`; settings `Detector`, `Extraction`
+bright targets of an image         `detect`
+velocity of a moving point         `moving_point_velocity`, within a `Search`
+the same, from a start             `LikelihoodVelocity`, `GradientVelocity`
+the same, baselines                `interferometry`, `AlongTrackAutofocus`, `SignalIntensityRatio`
+velocity, lines still migrate      `MigratingLines`, `WalkAmbiguity`
+expected amplitude over slow time  `Dwell`, `ElementBeam`
+range migration                    `correct_migration` by `Keystone`, `StaticBulk` or `NoMigration`,
+                                   on a `Frame`
+full Doppler band of a point       `reconstruct` with `LeastSquares` or `MinimumMeanSquare`, for a
+                                   `PointMotion`
+expected power over Doppler        `FlatBand`, `ElementPattern`
+quality of a reconstruction        `condition_number`, `noise_gain_db`; `doppler_offsets` of its
+                                   bins
+azimuth image of a point           `focus_azimuth`
+=================================  =================================================================
+
+Most functions are stages of chains, too: `Reconstruct` calls `reconstruct`, and so on.
 """
 
 from torchsar.multichannel.azimuth import (

@@ -1,4 +1,17 @@
-"""Optimisers that minimise one cost function per trial, for all trials at once."""
+"""Optimisers that minimise one cost function per trial, for all trials at once.
+
+================================  ===================================
+cost function                     what to use
+================================  ===================================
+smooth, many unknowns             `lbfgs`
+smooth, few unknowns              `newton`
+noisy, or rough on a small scale  `adam`
+several minima, few unknowns      `grid_search`
+several minima, within bounds     `differential_evolution`, `genetic`
+================================  ===================================
+
+The first three return a `Descent`, the searches a `Searched`.
+"""
 
 from torchsar.optim.descent import Descent, adam, lbfgs
 from torchsar.optim.newton import newton

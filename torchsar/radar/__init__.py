@@ -1,4 +1,26 @@
-"""Descriptions of instruments: radars and ladars, their geometry, timing, orbits and waveforms."""
+"""Descriptions of instruments: radars and ladars, their geometry, timing, orbits and waveforms.
+
+=====================================  ============================================================
+instrument or task                     what to use
+=====================================  ============================================================
+side-looking radar on a straight path  `StripmapRadar`, with the pulse `LinearFM`
+rotating target (ISAR, ISAL)           `InverseRadar`
+ladar with triangular sweeps           `TriangularLadar`; `sweep_middles` for the times of the
+                                       sweeps
+distant transmitter, several channels  `BistaticRadar`; `range_coefficients` for the transmit range
+antennas on any path                   `AntennaPath`; `StraightTrack` for the nominal path
+positions from navigation              `resample_path` to the times of the pulses
+spotlight or turntable geometry        `Spotlight`, exact; `FarField`, plane waves; `geometry_of`
+                                       from a recording
+frequency samples, range profiles      `range_profiles` and `frequency_samples` change one into the
+                                       other
+orbit of a satellite                   `Orbit`, or `Ephemeris` with the line of sight; `seen_point`
+                                       on the Earth
+pulse rate of a satellite              `timing_diagram`, which returns a `TimingDiagram`
+position on the Earth                  `geocentric` coordinates, `LocalFrame` about a point
+speed of light                         `LIGHT_M_S`
+=====================================  ============================================================
+"""
 
 from torchsar.radar.antenna_path import AntennaPath
 from torchsar.radar.bistatic import BistaticRadar

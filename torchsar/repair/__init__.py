@@ -1,7 +1,29 @@
 """Correction of impaired raw data.
 
-It covers missing lines, interference, sampling jitter and frequency response of the receiver,
-imbalance of its channels, and the sweeps of ladars. A line is the record of one pulse along range.
+A line is the record of one pulse along range.
+
+==================================  ================================================================
+impairment                          what to use
+==================================  ================================================================
+line numbers, irregular lines       `line_integrity`, first of all
+missing lines                       `sparse_fill`; faster and less exact `band_limited_fill`,
+                                    `linear_fill`, `zero_fill`
+narrowband interference             `subtract_interference`; `notch_interference`;
+                                    `drop_interference` with a fill after it
+sampling jitter, with a pilot tone  `estimate_jitter_pilot`, then `correct_jitter`
+sampling jitter, without a pilot    `estimate_jitter_blind`, then `correct_jitter` (by
+                                    `BandLimited`; faster `Lagrange`)
+response of the receiver            `estimate_response_sharpest` or `estimate_response_points`; the
+                                    amplitude too `EstimateFlatResponse`; then `correct_response`
+channels that record lines in turn  `estimate_imbalance`, then `correct_imbalance`
+continuous record of a ladar        `SplitSweeps`, with `find_trigger` where the start is not known;
+                                    `blank_turning_points`; as published `circular_shift`
+non-linear sweeps of a ladar        `calibrate_sweeps`
+==================================  ================================================================
+
+Most functions are stages of chains, too: `SparseFill` calls `sparse_fill`, and so on. `PilotJitter`
+and `BlindJitter` are the stages of the estimators of jitter, and `EstimateResponse` is that of both
+functions for the response.
 """
 
 from torchsar.repair.channels import CorrectImbalance, EstimateImbalance, correct_imbalance, estimate_imbalance

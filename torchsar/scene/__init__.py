@@ -3,6 +3,35 @@
 A world collects everything that is true about an acquisition; `torchsar.echo` turns it into a
 recording and the true parameters of this recording. All objects are immutable (frozen dataclasses).
 
+================================  ==================================================================
+to describe                       what to use
+================================  ==================================================================
+world seen by a stripmap radar    `StripmapWorld`; ranges `Hyperbola` or `Parabola`; beams
+                                  `AlwaysLit`, `Dwell`, `Antenna`
+world of a rotating target        `TurntableWorld` with `PolynomialRotation`; echo `Dechirped` or
+                                  `PhaseOnly`
+world of a triangular ladar       `LadarWorld`; `CalibrationFibre` where the sweeps are not linear
+range within a sweep of a ladar   `LinearInSweep`; `EverySample` is exact; `QuadraticInSweep`,
+                                  `OnePerSweep`, `OnePerPeriod`
+moving targets, several channels  `BistaticWorld`; gain `Pattern` or `BandLimited`; ranges
+                                  `ExactRange` or `TaylorRange`; transmit range `OrbitTransmit` or
+                                  `PolynomialTransmit`
+world seen from any path          `PathWorld` with a `Flight`, its `Navigation`, a `PlaneGround` and
+                                  a `SideBeam`
+path of an antenna                `StraightPath` or `CircularPath`; deviations `Sway`, with
+                                  `Jitter`, `RandomWalk`, `Offset` and the motions below
+point targets                     `Points`, `RandomPoints`; `Together` joins a `Scene` with others;
+                                  they become `Scatterers`
+surface                           `Speckle`, `KSea`, `ImageReflectivity`
+moving points and ships           `MovingPoints`, `Ship`, `GroundMovers`; `Fleet` joins them
+models of targets                 `Aircraft`, `Satellite`, `SpreadRows`, `LetterE`,
+                                  `RetroAndBrokenLine`
+motion along the line of sight    `Motion`: `Polynomial`, `Sinusoid`, `VibrationSpectrum`,
+                                  `MeasuredTrack`
+turbulent air                     `PathFluctuation` of the path, `LogAmplitude` of the amplitude
+start phase of each pulse         `StartPhase`, normal; `UniformStartPhase`, incoherent pulses
+================================  ==================================================================
+
 A parameter annotated `Tensor | float` is a number, equal in all trials, or a tensor of shape
 (trials,) with one value per trial. Parameters annotated with a plain type are fixed for all trials,
 because they decide shapes or choose a model.
