@@ -137,9 +137,9 @@ class StaticBulk:
     >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)
     >>> world = scene.BistaticWorld(scene.MovingPoints([20], [0], [0], [0]), scene.BandLimited(1.0))
     >>> channels = echo.simulate_bistatic(receiver, world, 170, 64, Draws(seed=1))[0].signal
-    >>> shifted = multichannel.CorrectMigration(receiver, multichannel.StaticBulk())(channels)
-    >>> len(shifted.data[1].abs().argmax(-1).unique())  # range cells of the point, which walks
-    5
+    >>> bulk = multichannel.CorrectMigration(receiver, multichannel.StaticBulk())
+    >>> [len(bulk(channels, u).data[1].abs().argmax(-1).unique()) for u in (0.0, 20.0)]  # cells
+    [5, 1]
 
     Exact for a point that moves as the reference does, whatever its Doppler ambiguity. The range
     walk of other points relative to the reference remains.

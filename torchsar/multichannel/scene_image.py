@@ -121,7 +121,7 @@ class ImageMovers(Stage):
     >>> channels = echo.simulate_bistatic(receiver, world, 160, 84, Draws(seed=1))[0].signal
     >>> images = multichannel.ImageMovers(receiver, multichannel.Extraction(60, 30, 0.5, 0.25))(
     ...     channels, known=[multichannel.PointMotion.of(receiver, channels.data, 6.0)]
-    ... )
+    ... )  # the target is at azimuth sample 160
     >>> [int(x.data.abs().amax(-1).argmax()) for x in (images.conventional, images.fused)]
     [280, 160]
 
@@ -584,7 +584,7 @@ def detect(
     >>> from torchsar import Axis, Signal, multichannel
     >>> axes = Axis("azimuth", 256, -256.0, 2.0, "m"), Axis("range", 64, 4840.0, 5.0, "m")
     >>> image = torch.ones(256, 64, dtype=torch.complex64)
-    >>> image[168:188, 31:34] = 10  # a ship
+    >>> image[168:188, 31:34] = 10  # a ship at 99 m
     >>> [(round(x.azimuth_m), round(x.range_m)) for x in multichannel.detect(Signal(image, axes))]
     [(98, 5000)]
 
