@@ -15,6 +15,13 @@ from torchsar.core import refuse_non_finite
 class AntennaPath:
     """Positions of transmitter and receiver at every pulse, and the paths to which phases refer.
 
+    >>> import torch
+    >>> from torchsar import radar
+    >>> position_m = torch.tensor([[-3.0, 0.0, 0.0], [0.0, 0.0, 0.0], [3.0, 0.0, 0.0]]).double()
+    >>> path = radar.AntennaPath(position_m, None, reference_m=torch.full((3,), 8.0).double())
+    >>> path.path_m(torch.tensor([[0.0, 4.0, 0.0]]))[:, 0].tolist()
+    [2.0, 0.0, 2.0]
+
     The echo of a point at x has the path l = |transmitter - x| + |x - receiver| and, at the
     frequency f, the phase -2 pi f (l - reference) / c. Leading dimensions are trials with paths of
     their own; those of the three tensors broadcast.

@@ -18,6 +18,18 @@ from torchsar.radar.waveform import LinearFM
 class BistaticRadar(Instrument):
     """Bistatic radar: a far transmitter with a low pulse rate, and an airborne receiver.
 
+    >>> from torchsar import radar
+    >>> receiver = radar.BistaticRadar(
+    ...     carrier_hz=3e9,
+    ...     pulse=radar.LinearFM(bandwidth_hz=40e6, duration_s=10e-6),
+    ...     sampling_hz=50e6,
+    ...     prf_hz=180.0,
+    ...     speed_m_s=120.0,
+    ...     reference_range_m=5000.0,
+    ... )
+    >>> receiver.channels, round(receiver.ambiguous_velocity_m_s, 2)
+    (3, 17.99)
+
     The receiver has several channels along its track. The phase of an echo is -2 pi (R_T + R_m) /
     lambda, with the one-way ranges R_T from the transmitter to the target and R_m from the target
     to the channel m. The range axis holds R_m = c tau - R_T, where tau is the delay of the echo, in

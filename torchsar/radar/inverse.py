@@ -13,6 +13,12 @@ from torchsar.radar.instrument import LIGHT_M_S, Instrument
 class InverseRadar(Instrument):
     """Inverse synthetic aperture radar or ladar whose range window follows the target.
 
+    >>> from torchsar import radar
+    >>> ladar = radar.InverseRadar(193e12, bandwidth_hz=15e9, prf_hz=1e3, rotation_rad_s=0.01)
+    >>> axes = ladar.image_axes(ladar.raw_axes(n_pulse=100, n_range=64))
+    >>> [(axis.name, round(1e3 * axis.step, 2)) for axis in axes]  # cells in millimetres
+    [('azimuth', 0.78), ('range', 9.99)]
+
     Args:
         carrier_hz: Middle of the band in Hz.
         bandwidth_hz: Bandwidth B of the range-compressed samples in Hz; a range cell is c / (2 B).

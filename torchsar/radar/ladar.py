@@ -20,6 +20,18 @@ Detection = Literal["complex", "real"]
 class TriangularLadar(Instrument):
     """Symmetric triangular FMCW ladar that is dechirped on receive (STLFMCW).
 
+    >>> from torchsar import radar
+    >>> ladar = radar.TriangularLadar(
+    ...     carrier_hz=2e14,
+    ...     bandwidth_hz=5e9,
+    ...     period_s=16e-6,
+    ...     sample_rate_hz=64e6,
+    ...     speed_m_s=60.0,
+    ...     reference_range_m=3000.0,
+    ... )
+    >>> ladar.sweep_samples, round(ladar.range_step_m, 3), round(ladar.beat_hz(3.0) / 1e6, 1)
+    (512, 0.03, 12.5)
+
     In a period that starts at t the middle of the up sweep is at t + period / 4, the turning point
     at t + period / 2, and the middle of the down sweep at t + 3 period / 4.
 
@@ -197,6 +209,12 @@ class TriangularLadar(Instrument):
 
 def sweep_middles(radar: TriangularLadar, pulse: Axis, device: torch.device | str | None = None) -> Tensor:
     """Return the slow times of the middles of the up and down sweeps.
+
+    >>> from torchsar import radar
+    >>> ladar = radar.TriangularLadar(2e14, 5e9, 16e-6, 64e6, 60.0, 3000.0)
+    >>> _, pulse, _ = ladar.sweep_axes(n_period=3, start_s=0.0)
+    >>> (1e6 * radar.sweep_middles(ladar, pulse)).round(decimals=3).tolist()  # in microseconds
+    [[4.0, 20.0, 36.0], [12.0, 28.0, 44.0]]
 
     Args:
         radar: Radar parameters.

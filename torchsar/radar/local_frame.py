@@ -19,6 +19,12 @@ _ECCENTRICITY2 = FLATTENING * (2 - FLATTENING)
 def geocentric(latitude_deg: Tensor, longitude_deg: Tensor, height_m: Tensor) -> Tensor:
     """Convert geodetic coordinates on WGS 84 to geocentric Cartesian ones (ECEF).
 
+    >>> import torch
+    >>> from torchsar import radar
+    >>> latitude, longitude, height = torch.tensor([90.0, 0.0, 100.0]).double()  # over the pole
+    >>> radar.geocentric(latitude, longitude, height).round(decimals=1).tolist()
+    [0.0, 0.0, 6356852.3]
+
     With the radius N = a / sqrt(1 - e^2 sin^2 lat) of curvature in the prime vertical:
 
         x = (N + h) cos lat cos lon,  y = (N + h) cos lat sin lon,  z = (N (1 - e^2) + h) sin lat.
@@ -53,6 +59,13 @@ def geocentric(latitude_deg: Tensor, longitude_deg: Tensor, height_m: Tensor) ->
 @dataclass(frozen=True)
 class LocalFrame:
     """Local Cartesian coordinates (east, north, up) about a point on or above the Earth.
+
+    >>> import torch
+    >>> from torchsar import radar
+    >>> frame = radar.LocalFrame(latitude_deg=48.0, longitude_deg=11.0, height_m=500.0)
+    >>> latitude, longitude, height = torch.tensor([48.01, 11.0, 600.0]).double()
+    >>> frame.local_m(radar.geocentric(latitude, longitude, height)).round().long().tolist()
+    [0, 1112, 100]
 
     The frame is tangent to the ellipsoid of WGS 84. With the geocentric position o of the origin,
     east = (x - o) . (-sin lon, cos lon, 0), north = (x - o) . (-sin lat cos lon, -sin lat sin lon,

@@ -21,6 +21,13 @@ def resample_path(
 ) -> Tensor:
     """Interpolate recorded positions of an antenna at the times of the pulses by cubic splines.
 
+    >>> import torch
+    >>> from torchsar import radar
+    >>> time_s = torch.arange(6).double()
+    >>> position_m = torch.stack([50 * time_s, time_s.square(), 100 + 0 * time_s], dim=-1)
+    >>> radar.resample_path(time_s, position_m, torch.tensor([2.5]).double()).round(decimals=3)
+    tensor([[125.0000,   6.2500, 100.0000]], dtype=torch.float64)
+
     Times may be uneven. All clocks must agree; to correct a latency, subtract it from `time_s`. The
     spline passes through the records, so that their noise enters the positions. Differentiable in
     all tensors.

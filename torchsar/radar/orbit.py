@@ -25,6 +25,12 @@ EARTH_RATE_RAD_S = 7.2921159e-5  # one rotation in a sidereal day of 86164.09 s
 class Orbit:
     """Kepler orbit about a spherical Earth in the Earth-centred inertial frame.
 
+    >>> import torch
+    >>> from torchsar import radar
+    >>> position_m, velocity_m_s = radar.Orbit.at_height(500e3).state(torch.zeros(1).double())
+    >>> round(position_m.norm().item()), round(velocity_m_s.norm().item())
+    (6878137, 7613)
+
     The z axis is the axis of the Earth; angles are counted from the x axis. Each element is a
     number or a tensor (...,) that may require gradients.
 
@@ -173,6 +179,13 @@ def seen_point(
 ) -> Tensor:
     """Return the point of the spherical Earth on the line of sight of a satellite.
 
+    >>> import torch
+    >>> from torchsar import radar
+    >>> position_m, velocity_m_s = radar.Orbit.at_height(500e3).state(torch.zeros(1).double())
+    >>> point_m = radar.seen_point(position_m, velocity_m_s, off_nadir_deg=30.0)
+    >>> round((point_m - position_m).norm().item() / 1e3)  # slant range in km
+    585
+
     The squint rotates the line of sight about the nadir: 0 degrees is across the path of the
     satellite relative to the rotating Earth (on a circular orbit the range rate is then zero), 90
     degrees is ahead along that path.
@@ -277,6 +290,13 @@ def earth_series(point_m: Tensor, order: int) -> list[Tensor]:
 def range_coefficients(orbit: Orbit, point_m: Tensor, time_s: Tensor, order: int = 4) -> Tensor:
     """Return the Taylor coefficients k1, k2, ... of the transmit range about given times.
 
+    >>> import torch
+    >>> from torchsar import radar
+    >>> orbit, time_s = radar.Orbit.at_height(500e3), torch.zeros(1).double()
+    >>> point_m = radar.seen_point(*orbit.state(time_s), off_nadir_deg=30.0, squint_deg=20.0)
+    >>> radar.range_coefficients(orbit, point_m, time_s, order=2).round().long().tolist()
+    [[-1216, 39]]
+
     The transmit range R is that from the transmitter to the scene point. At the time t after a time
     of expansion it is R + k1 t + k2 t^2 + ...; the coefficients are exact and differentiable. With
     dr, dv, da the differences of position, velocity and acceleration between transmitter and point,
@@ -327,6 +347,11 @@ def orbit_range(orbit: Orbit, point_m: Tensor, epoch_s: Tensor | float, time_s: 
 @dataclass(frozen=True)
 class Ephemeris:
     """Orbit of a transmitter over a rotating spherical Earth, and its line of sight to the scene.
+
+    >>> from torchsar import radar
+    >>> satellite = radar.Ephemeris(height_m=600e3, off_nadir_deg=30.0, squint_deg=20.0)
+    >>> [round(k) for k in satellite.transmit_coefficients()[:2]]  # m/s and m/s^2
+    [-1249, 34]
 
     Args:
         height_m: Semi-major axis minus the radius of the Earth, in metres; the height of the orbit

@@ -21,6 +21,12 @@ from torchsar.radar.instrument import LIGHT_M_S
 def range_profiles(samples: Tensor) -> Tensor:
     """Transform frequency samples to range profiles by a unitary inverse Fourier transform.
 
+    >>> import torch
+    >>> from torchsar import radar
+    >>> samples = torch.ones(4, dtype=torch.complex64)  # of a point at range zero
+    >>> radar.range_profiles(samples).abs().round(decimals=3).tolist()
+    [0.0, 0.0, 2.0, 0.0]
+
     Args:
         samples: Frequency samples, shape (..., n), complex.
 
@@ -37,6 +43,12 @@ def range_profiles(samples: Tensor) -> Tensor:
 
 def frequency_samples(profiles: Tensor) -> Tensor:
     """Transform range profiles (..., n) to frequency samples, the inverse of `range_profiles`.
+
+    >>> import torch
+    >>> from torchsar import radar
+    >>> profile = torch.tensor([0, 0, 2, 0], dtype=torch.complex64)  # a point at range zero
+    >>> radar.frequency_samples(profile).abs().round(decimals=3).tolist()
+    [1.0, 1.0, 1.0, 1.0]
 
     The transform is unitary, so that it is also the adjoint.
 
@@ -129,6 +141,14 @@ class _Geometry:
 class FarField(_Geometry):
     """Plane-wave geometry: the range of a ground point (x, y) is direction . (x, y) + offset.
 
+    >>> import torch
+    >>> from torchsar import radar
+    >>> frequency_hz = torch.linspace(9e9, 10e9, 64, dtype=torch.float64)
+    >>> angle_rad = torch.tensor([0.0, torch.pi / 2], dtype=torch.float64)
+    >>> waves = radar.FarField.turntable(frequency_hz, angle_rad)
+    >>> waves.range_m(slice(None), torch.tensor([3.0]), torch.tensor([2.0]))[:, 0].round(decimals=3)
+    tensor([3., 2.], dtype=torch.float64)
+
     The curvature of the wavefront is neglected. `Spotlight.neglected_range_m` gives the resulting
     range error.
 
@@ -189,6 +209,14 @@ class FarField(_Geometry):
 @dataclass(frozen=True, eq=False)
 class Spotlight(_Geometry):
     """Spotlight geometry: antenna positions about the scene centre, and reference ranges.
+
+    >>> import torch
+    >>> from torchsar import radar
+    >>> frequency_hz = torch.linspace(9e9, 10e9, 64).double()
+    >>> position_m = torch.tensor([[0.0, -1000.0, 0.0]]).double()
+    >>> geometry = radar.Spotlight(frequency_hz, position_m, torch.tensor([1000.0]).double())
+    >>> round(geometry.neglected_range_m(torch.tensor([20.0]), torch.tensor([0.0])).item(), 3)
+    0.2
 
     In a range profile the point p lies at the range |position - p| - reference.
 
@@ -284,6 +312,14 @@ def geometry_of(
     height_m: float = 0.0,
 ) -> FarField | Spotlight:
     """Build the imaging geometry from the frequencies and angles or positions of a recording.
+
+    >>> import torch
+    >>> from torchsar import radar
+    >>> frequency_hz = torch.linspace(9e9, 10e9, 64, dtype=torch.float64)
+    >>> position_m = torch.tensor([[-3.0, 0.0, 4.0]]).double()
+    >>> geometry = radar.geometry_of(frequency_hz, position_m=position_m)
+    >>> type(geometry).__name__, geometry.reference_m.tolist()
+    ('Spotlight', [5.0])
 
     Args:
         frequency_hz: Frequencies in Hz, float64 (n,).

@@ -14,6 +14,13 @@ from torchsar.radar.antenna_path import refuse_unusable
 class StraightTrack:
     """Straight line with pulses at even steps.
 
+    >>> import torch
+    >>> from torchsar import radar
+    >>> position_m = torch.tensor([[0.0, 0.0, 9.0], [3.0, 4.0, 9.0], [6.0, 8.0, 9.0]]).double()
+    >>> track = radar.StraightTrack.fitted(position_m)
+    >>> round(track.step_m, 3), track.along_m(position_m).round(decimals=3).tolist()
+    (5.0, [-5.0, 0.0, 5.0])
+
     Args:
         origin_m: A position on the line in metres, float64 (3,); coordinates along the track are
             zero there.

@@ -17,6 +17,18 @@ from torchsar.radar.waveform import LinearFM
 class StripmapRadar(Instrument):
     """Stripmap radar on a straight path, described in the slant plane.
 
+    >>> from torchsar import radar
+    >>> sensor = radar.StripmapRadar(
+    ...     carrier_hz=3.2e9,
+    ...     pulse=radar.LinearFM(bandwidth_hz=40e6, duration_s=0.5e-6),
+    ...     sampling_hz=50e6,
+    ...     prf_hz=400.0,
+    ...     velocity_m_s=120.0,
+    ...     near_range_m=4000.0,
+    ... )
+    >>> round(sensor.range_step_m, 2), round(sensor.range_resolution_m, 2), sensor.pulse_samples
+    (3.0, 3.32, 25)
+
     The nominal effective velocity also gives images their azimuth axis, x = velocity * slow time.
 
     Args:

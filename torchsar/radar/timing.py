@@ -60,6 +60,14 @@ def timing_diagram(
 ) -> TimingDiagram:
     """Compute the timing diagram of a satellite that receives its own echoes.
 
+    >>> import torch
+    >>> from torchsar import radar
+    >>> prf_hz = torch.tensor([1500.0, 2000.0]).double()
+    >>> ground_m = torch.linspace(200e3, 300e3, 101).double()
+    >>> diagram = radar.timing_diagram(600e3, prf_hz, ground_m, pulse_s=20e-6)
+    >>> diagram.swath_fits(30e3).sum(-1).tolist()  # at how many positions 30 km may begin
+    [71, 59]
+
     The Earth is spherical. The echo of a ground position begins at its two-way delay and lasts
     pulse_s. It must stay guard_s away from the transmitted pulses, which begin at k / PRF for whole
     numbers k, and from the nadir echoes, which begin at 2 height / c + k / PRF and last pulse_s +

@@ -15,6 +15,11 @@ from torchsar.core import unit_phasor
 class LinearFM:
     """Linear frequency-modulated pulse exp(j pi k (t - T / 2)^2) for 0 <= t < T.
 
+    >>> from torchsar import radar
+    >>> pulse = radar.LinearFM(bandwidth_hz=40e6, duration_s=0.5e-6)
+    >>> round(pulse.rate_hz_s / 1e12), pulse.samples(sampling_hz=50e6).shape
+    (80, torch.Size([25]))
+
     T is the duration, and k = direction * bandwidth / duration is the chirp rate. The time t counts
     from the leading edge of the pulse, so that the frequency passes zero at t = T / 2. The first
     sample lies exactly on the leading edge: sample i is taken at t = i / fs, where fs is the

@@ -172,6 +172,13 @@ def _phases(product: Tensor, channels: int, doppler_cycles: Tensor | float | Non
 def correct_imbalance(x: Tensor, gain: Tensor, phase_rad: Tensor) -> Tensor:
     """Divide the lines of channel c by gain[c] exp(j phase[c]).
 
+    >>> import torch
+    >>> from torchsar import repair
+    >>> lines = torch.tensor([1, 2j, 1, 2j], dtype=torch.complex64)[:, None]  # channels 0, 1, 0, 1
+    >>> gain, phase_rad = torch.tensor([1.0, 2.0]), torch.tensor([0.0, torch.pi / 2])
+    >>> repair.correct_imbalance(lines, gain, phase_rad).real[:, 0].tolist()
+    [1.0, 1.0, 1.0, 1.0]
+
     Channel c of C channels recorded the lines i with i mod C = c. Differentiable.
 
     Args:

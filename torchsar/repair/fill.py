@@ -34,6 +34,13 @@ def _mask(lines: Tensor, missing: Tensor) -> Tensor:
 def zero_fill(lines: Tensor, missing: Tensor) -> Tensor:
     """Set missing lines to zero, the simplest of the fills.
 
+    >>> import torch
+    >>> from torchsar import repair
+    >>> lines = torch.ones(4, 2, dtype=torch.complex64)
+    >>> missing = torch.tensor([False, True, False, False])
+    >>> repair.zero_fill(lines, missing).real[:, 0].tolist()
+    [1.0, 0.0, 1.0, 1.0]
+
     Args:
         lines: Lines, shape (..., pulse, range), complex.
         missing: Missing lines, shape (..., pulse), bool.
@@ -51,6 +58,13 @@ def zero_fill(lines: Tensor, missing: Tensor) -> Tensor:
 
 def linear_fill(lines: Tensor, missing: Tensor, doppler_turns: Tensor | float = 0.0) -> Tensor:
     """Interpolate missing lines linearly between the nearest received ones.
+
+    >>> import torch
+    >>> from torchsar import repair
+    >>> lines = torch.tensor([1.0, 0.0, 3.0, 4.0], dtype=torch.complex64)[:, None]  # line 1 is lost
+    >>> missing = torch.tensor([False, True, False, False])
+    >>> repair.linear_fill(lines, missing).real[:, 0].tolist()
+    [1.0, 2.0, 3.0, 4.0]
 
     The phase increment of the Doppler centroid from line to line is removed before the
     interpolation and restored afterwards. Missing lines before the first or after the last received
@@ -116,6 +130,14 @@ def azimuth_spectrum(lines: Tensor, received: Tensor, lags: int = 24) -> Tensor:
 
 def band_limited_fill(lines: Tensor, missing: Tensor, rounds: int = 2, steps: int = 8) -> Tensor:
     """Fill missing lines by least squares, with the azimuth spectrum of the received ones (Wiener).
+
+    >>> import torch
+    >>> from torchsar import repair
+    >>> lines = torch.exp(0.25j * torch.pi * torch.arange(64))[:, None]  # Doppler of PRF / 8
+    >>> missing = torch.arange(64) % 8 == 3
+    >>> filled = repair.band_limited_fill(lines * ~missing[:, None], missing)
+    >>> round((filled - lines).abs().max().item(), 2)
+    0.0
 
     Conjugate gradients find the missing lines that minimise the sum of |D(f)|^2 / S(f) over the
     azimuth frequencies f, where D is the azimuth spectrum of all lines and S the expected power

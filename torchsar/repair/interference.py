@@ -51,6 +51,14 @@ class Repaired:
 def notch_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
     """Set contaminated cells of the range spectrum to zero: a notch filter, the simplest method.
 
+    >>> import torch
+    >>> from torchsar import repair
+    >>> raw = torch.randn(8, 256, dtype=torch.complex64, generator=torch.Generator().manual_seed(1))
+    >>> raw[3] += 10 * torch.exp(0.5j * torch.pi * torch.arange(256))
+    >>> found = repair.notch_interference(raw)
+    >>> [round(lines[3].abs().square().mean().item()) for lines in (raw, found.data)]
+    [101, 1]
+
     The clutter of those cells is removed as well. Side lobes of a tone that are below the threshold
     remain; a line in which they make the power more than 1.5 times that of clutter is set to zero
     and marked as missing. Differentiable in the lines.
@@ -86,6 +94,14 @@ def notch_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
 def drop_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
     """Set contaminated lines to zero and mark them as missing, so that a later stage can fill them.
 
+    >>> import torch
+    >>> from torchsar import repair
+    >>> raw = torch.randn(8, 256, dtype=torch.complex64, generator=torch.Generator().manual_seed(1))
+    >>> raw[3] += 10 * torch.exp(0.5j * torch.pi * torch.arange(256))
+    >>> found = repair.drop_interference(raw)
+    >>> found.missing.nonzero().tolist(), found.data[3].abs().max().item()
+    ([[3]], 0.0)
+
     Differentiable in the lines.
 
     Args:
@@ -112,6 +128,14 @@ def drop_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
 
 def subtract_interference(raw: Tensor, threshold: float = THRESHOLD, most_tones: int = 4) -> Repaired:
     """Subtract tones by maximum likelihood, and wider interference as a narrowband random process.
+
+    >>> import torch
+    >>> from torchsar import repair
+    >>> raw = torch.randn(8, 256, dtype=torch.complex64, generator=torch.Generator().manual_seed(1))
+    >>> raw[3] += 10 * torch.exp(0.5j * torch.pi * torch.arange(256))
+    >>> found = repair.subtract_interference(raw)
+    >>> found.touched.nonzero().tolist(), round(found.tone_cycles[3].item(), 3)
+    ([[3]], 0.25)
 
     A tone has its own frequency, linear drift, amplitude and phase in each line. Wider interference
     is subtracted in up to three bands, each narrower than about 1/40 of the sampling rate fs. The

@@ -274,6 +274,14 @@ class Lagrange:
 class BandLimited:
     """Correction of jitter by the best local weights for a band-limited signal.
 
+    >>> import torch
+    >>> from torchsar import repair
+    >>> n, offset = torch.arange(64), torch.tensor([-0.1, 0.1])
+    >>> jittered, even = (torch.exp(0.5j * torch.pi * x)[None] for x in (n + offset.repeat(32), n))
+    >>> left = repair.BandLimited(points=12, band=0.8)(jittered, offset) - even
+    >>> round(left.abs().max().item(), 2), round((jittered - even).abs().max().item(), 2)
+    (0.0, 0.16)
+
     As fast as `Lagrange` and much more accurate, and called in the same way: for a band of 0.8 and
     offsets of up to 0.18 sample the error is -29, -43 and -55 dB with 4, 8 and 12 points; that of
     Lagrange interpolation is -23, -28 and -32 dB.
@@ -315,6 +323,14 @@ def correct_jitter(
     method: Callable[[Tensor, Tensor], Tensor] | None = None,
 ) -> Tensor:
     """Correct the periodic timing jitter of lines, where the period may differ between trials.
+
+    >>> import torch
+    >>> from torchsar import repair
+    >>> n, offset = torch.arange(64), torch.tensor([-0.1, 0.1])
+    >>> jittered, even = (torch.exp(0.5j * torch.pi * x)[None] for x in (n + offset.repeat(32), n))
+    >>> left = repair.correct_jitter(jittered, offset) - even
+    >>> round(left.abs().max().item(), 2), round((jittered - even).abs().max().item(), 2)
+    (0.0, 0.16)
 
     Trials with equal periods are processed together. If `period` is given, trials whose offsets are
     all zero are unchanged.

@@ -313,6 +313,15 @@ def refine_offsets(y: Tensor, period: int, passes: int) -> tuple[Tensor, Tensor]
 class BlindJitter(Stage):
     """Estimator of periodic sampling jitter from the clutter of the recording.
 
+    >>> import torch
+    >>> from torchsar import Signal, radar, repair
+    >>> noise = torch.randn(64, 256, generator=torch.Generator().manual_seed(1)) + 0j
+    >>> clutter = torch.fft.ifft(noise * (torch.fft.fftfreq(256).abs() < 0.4))  # in 0.8 of the band
+    >>> jittered = repair.correct_jitter(clutter, torch.tensor([0.1, -0.1]))
+    >>> lines = Signal(jittered, radar.InverseRadar(10e9, 1e9, 1e3).raw_axes(64, 256))
+    >>> repair.BlindJitter(max_period=4)(lines)["offset_samples"].round(decimals=1).tolist()
+    [-0.1, 0.1, -0.1, 0.1]
+
     If this stage is named "blind" in a chain, the jitter is corrected by the later stage
     `use(CorrectJitter(), offset_samples="blind", period="blind")`.
 

@@ -151,6 +151,14 @@ def _choose(noise: Tensor, power: Tensor, jitter: Tensor, n: int) -> Tensor:
 class PilotJitter(Stage):
     """Estimator of periodic sampling jitter from a recorded pilot tone.
 
+    >>> import torch
+    >>> from torchsar import Signal, radar, repair
+    >>> n, offset = torch.arange(64), torch.tensor([-0.1, 0.1])
+    >>> pilot = torch.exp(0.4j * torch.pi * (n + offset.repeat(32)))
+    >>> lines = Signal(pilot[None], radar.InverseRadar(10e9, 1e9, 1e3).raw_axes(1, 64))
+    >>> repair.PilotJitter(max_period=4)(lines, pilot)["offset_samples"].round(decimals=3).tolist()
+    [-0.1, 0.1, -0.1, 0.1]
+
     In a chain, `use(PilotJitter(), pilot="aux.pilot")` takes the record of the tone from the side
     data `pilot` of the recording. The signal is unchanged.
 

@@ -124,6 +124,13 @@ def line_integrity(
 ) -> Estimate:
     """Verify line numbers and plan the regular azimuth grid.
 
+    >>> import torch
+    >>> from torchsar import repair
+    >>> lines = torch.arange(1, 9).to(torch.complex64)[:, None]
+    >>> number = torch.tensor([10, 11, 12, 14, 15, 16, 17, 18])  # line 13 is lost
+    >>> repair.line_integrity(lines, number)["missing"].nonzero().tolist()
+    [[3]]
+
     Repeated lines (samples equal to those of the line before) are dropped. A number that
     contradicts its neighbours is corrected if the lines beside it leave only one position for it; a
     line that fits several positions of a gap is left out and marked as unplaced, and so is a line

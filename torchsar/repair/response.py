@@ -89,6 +89,14 @@ def on_axis(values: Tensor, u: Tensor) -> Tensor:
 def correct_response(x: Tensor, phase_rad: Tensor, amplitude: Tensor | None, band: float) -> Tensor:
     """Remove the phase and amplitude response of the channel along range.
 
+    >>> import torch
+    >>> from torchsar import repair
+    >>> point = torch.zeros(64, 64, dtype=torch.complex64)
+    >>> point[32, 20] = 1
+    >>> phase_rad = 3 * torch.pi * torch.linspace(-1, 1, 1025).double()  # of 3 samples
+    >>> repair.correct_response(point, phase_rad, None, band=1.0)[32].abs().argmax().item()
+    23
+
     The middle of the pulse band must be at zero range frequency. Differentiable.
 
     Args:

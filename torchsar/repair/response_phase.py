@@ -398,6 +398,14 @@ def estimate_response_points(
 ) -> Estimate:
     """Estimate the phase response by the coherent average of the spectra of isolated bright points.
 
+    >>> import torch
+    >>> from torchsar import repair
+    >>> phase_rad = torch.linspace(-1, 1, 1025).double().square()
+    >>> image = repair.correct_response(torch.eye(2, 64).roll(20, 1) + 0j, -phase_rad, None, 0.8)
+    >>> found = repair.estimate_response_points(image, band=0.8, width=32, order=2)
+    >>> found["phase_rad"][[0, 512, 1024]].round(decimals=2).tolist()  # the mean is zero
+    [0.67, -0.33, 0.67]
+
     This is the simpler method. It uses one line of the image for each point and is more sensitive
     to noise than `estimate_response_sharpest`. It fails if the brightest maxima are not single
     points, or if the response spreads them over much of the window. The standard deviation is
@@ -442,6 +450,14 @@ def estimate_response_points(
 
 class EstimateResponse(Stage):
     """Estimator of the channel's phase and amplitude response from a focused image.
+
+    >>> import torch
+    >>> from torchsar import Signal, radar, repair
+    >>> sensor = radar.StripmapRadar(3.2e9, radar.LinearFM(40e6, 0.5e-6), 50e6, 400.0, 120.0, 4e3)
+    >>> image = Signal(torch.eye(64, 256) + 0j, sensor.image_axes(sensor.raw_axes(64, 256)))
+    >>> found = repair.EstimateResponse(sensor, method="points")(image)
+    >>> found["phase_rad"].shape, round(found["phase_rad"].abs().max().item(), 2), bool(found.ok)
+    (torch.Size([1025]), 0.0, True)
 
     The abrupt edges of the pulse have frequencies that alias. The phase that they leave in the
     image depends on where they lie between samples; it is about 0.01 rad, and no part of the
@@ -508,6 +524,14 @@ class EstimateResponse(Stage):
 
 class EstimateFlatResponse(EstimateResponse):
     """Estimator of the response from images with a flat range spectrum.
+
+    >>> import torch
+    >>> from torchsar import Signal, radar, repair
+    >>> sensor = radar.StripmapRadar(3.2e9, radar.LinearFM(40e6, 0.5e-6), 50e6, 400.0, 120.0, 4e3)
+    >>> image = Signal(torch.eye(64, 256) + 0j, sensor.image_axes(sensor.raw_axes(64, 256)))
+    >>> found = repair.EstimateFlatResponse(sensor, method="points")(image)
+    >>> [round(x.item(), 2) for x in found["amplitude"].aminmax()]  # a flat spectrum
+    [1.0, 1.0]
 
     The range compression must have used the reference "flat", which divides by the pulse spectrum
     inside the pulse band. Without an amplitude response, the image then has the same mean power at

@@ -391,6 +391,14 @@ def sparse_fill(
 ) -> Tensor:
     """Reconstruct the missing lines that are most probable under a model of the focused scene.
 
+    >>> import torch
+    >>> from torchsar import radar, repair
+    >>> sensor = radar.StripmapRadar(3.2e9, radar.LinearFM(40e6, 0.5e-6), 50e6, 400.0, 120.0, 4e3)
+    >>> lines = torch.exp(-0.0015j * torch.arange(-32, 32) ** 2)[:, None] * torch.eye(16)[8]
+    >>> missing = torch.arange(64) % 16 == 3
+    >>> (repair.sparse_fill(lines, missing, sensor, doppler_hz=0.0) - lines).abs().max() < 0.05
+    tensor(True)
+
     The image is split by Doppler into sub-looks, whose pixels are modelled as independent noise of
     slowly varying local power. The first estimate is that of `bright_fill`. Two looks are enough
     for scenes of points; four or more are useful for speckle that fills the PRF band. More than two

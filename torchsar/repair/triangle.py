@@ -207,6 +207,13 @@ def _taken(lines: Tensor, start: Tensor, n: int) -> Tensor:
 def circular_shift(record: Tensor, shift_s: float, radar: TriangularLadar) -> Tensor:
     """Shift the samples of each period circularly, as published; for comparisons only.
 
+    >>> import torch
+    >>> from torchsar import radar, repair
+    >>> ladar = radar.TriangularLadar(2e14, 5e9, 16e-6, 64e6, 60.0, 3000.0)
+    >>> record = torch.arange(2048.0).reshape(2, 1024)  # two periods
+    >>> repair.circular_shift(record, 2 / ladar.sample_rate_hz, ladar)[:, [0, -1]].tolist()
+    [[2.0, 1.0], [1026.0, 1025.0]]
+
     Samples that are one period apart become neighbours, which makes a phase step of 2 pi fd period
     (with the Doppler shift fd) inside a sweep. No estimator of the velocity tolerates this step,
     unless it lies a few samples from the end of a sweep. To separate sweeps use `split_record`,
@@ -235,6 +242,13 @@ def blank_turning_points(
     sweeps: Tensor, radar: TriangularLadar, farthest_m: float, nearest_m: float = 0.0, margin: int = 0
 ) -> Tensor:
     """Set the samples to zero at which local oscillator and echo sweep in opposite directions.
+
+    >>> import torch
+    >>> from torchsar import radar, repair
+    >>> ladar = radar.TriangularLadar(2e14, 5e9, 16e-6, 64e6, 60.0, 3000.0)
+    >>> sweeps = torch.ones(2, 3, ladar.sweep_samples, dtype=torch.complex64)  # ramp, pulse, time
+    >>> repair.blank_turning_points(sweeps, ladar, farthest_m=30.0)[0, 0].eq(0).sum().item()
+    13
 
     The echo of a scatterer at a range RD beyond the reference range turns 2 RD / c after the local
     oscillator, so that the first ceil(2 RD fs / c) samples of each sweep are set to zero (fs: the
@@ -279,6 +293,14 @@ def blank_turning_points(
 
 class SplitSweeps(Stage):
     """Separation of a record with the axes (pulse, time) into sweeps (ramp, pulse, fast_time).
+
+    >>> import torch
+    >>> from torchsar import Signal, radar, repair
+    >>> ladar = radar.TriangularLadar(2e14, 5e9, 16e-6, 64e6, 60.0, 3000.0)
+    >>> record = Signal(torch.zeros(3, 1024, dtype=torch.complex64), ladar.record_axes(3, 1024))
+    >>> sweeps = repair.SplitSweeps(ladar, trigger=1e-6)(record)
+    >>> sweeps.names, sweeps.data.shape
+    (('ramp', 'pulse', 'fast_time'), torch.Size([2, 2, 512]))
 
     The trigger is the start of the triangle. A trigger that is common to all trials is added to the
     slow time of the sweeps. Triggers that differ between trials are not added, since all trials
