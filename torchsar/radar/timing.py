@@ -65,7 +65,7 @@ def timing_diagram(
     >>> prf_hz = torch.tensor([1500.0, 2000.0]).double()
     >>> ground_m = torch.linspace(200e3, 300e3, 101).double()
     >>> diagram = radar.timing_diagram(600e3, prf_hz, ground_m, pulse_s=20e-6)
-    >>> diagram.swath_fits(30e3).sum(-1).tolist()  # at how many positions 30 km may begin
+    >>> diagram.swath_fits(30e3).sum(-1).tolist()  # where a swath of 30 km may begin
     [71, 59]
 
     The Earth is spherical. The echo of a ground position begins at its two-way delay and lasts

@@ -93,7 +93,7 @@ def correct_response(x: Tensor, phase_rad: Tensor, amplitude: Tensor | None, ban
     >>> from torchsar import repair
     >>> point = torch.zeros(64, 64, dtype=torch.complex64)
     >>> point[32, 20] = 1
-    >>> phase_rad = 3 * torch.pi * torch.linspace(-1, 1, 1025).double()  # of 3 samples
+    >>> phase_rad = 3 * torch.pi * torch.linspace(-1, 1, 1025).double()  # linear: 3 samples
     >>> repair.correct_response(point, phase_rad, None, band=1.0)[32].abs().argmax().item()
     23
 
