@@ -97,6 +97,14 @@ def backproject(
 ) -> Tensor:
     """Form the image of a phase history at any pixels by the direct sum over its pulses.
 
+    >>> import torch
+    >>> from torchsar import focus
+    >>> place_m = torch.tensor([[-300.0, 0.5 * y, 100.0] for y in range(-20, 20)]).double()
+    >>> given = (9.6e9 + 1e7 * torch.arange(16).double(), place_m, None, 2 * place_m.norm(dim=-1))
+    >>> points_m = torch.tensor([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0]]).double()
+    >>> focus.backproject(torch.ones(40, 16) + 0j, *given, points_m).abs().round()
+    tensor([640.,   1.])
+
         image(x) = sum_p sum_k s[p, k] exp(+2j pi f_k (l_p(x) - l_ref,p) / c),
 
     where l_p(x) is the path from the transmitter over the pixel to the receiver. A point of unit

@@ -23,6 +23,12 @@ def chirp_z(
 ) -> Tensor:
     """Evaluate the spectrum of samples on a uniform grid of frequencies by Bluestein's convolution.
 
+    >>> import torch
+    >>> from torchsar.focus import chirp_z
+    >>> samples = torch.ones(8, dtype=torch.complex128)
+    >>> chirp_z(samples, start=-0.125, step=0.0625, n=5).abs().round(decimals=3)
+    tensor([0.0000, 5.1260, 8.0000, 5.1260, 0.0000], dtype=torch.float64)
+
     The result X_i = sum_j x_j exp(-2j pi (start + i step) (j - centre)), i = 0..n-1, is exact to
     the precision of the data, since the chirps are formed from float64 phases. Differentiable in
     `x`, `start` and `step`.
@@ -64,6 +70,13 @@ def chirp_z(
 
 def keystone(data: Tensor, frequency_hz: Tensor, carrier_hz: float, ambiguity: Tensor | int = 0) -> Tensor:
     """Rescale slow time per range frequency, which removes the linear range walk of all targets.
+
+    >>> import torch
+    >>> from torchsar.focus import keystone
+    >>> t, f = (torch.arange(64) - 32.0)[:, None] / 64, torch.tensor([-1e8, 0.0, 1e8])
+    >>> data = torch.exp(2j * torch.pi * 20 * (1 + f / 1e9) * t)
+    >>> [torch.fft.fft(x, dim=0).abs().argmax(0).tolist() for x in (data, keystone(data, f, 1e9))]
+    [[18, 20, 22], [20, 20, 20]]
 
     Data s(t, f) over slow time t and range frequency f become s(t carrier / (carrier + f), f). The
     phase of a target of constant velocity is proportional to (carrier + f) t before the transform

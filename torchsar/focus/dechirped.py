@@ -25,6 +25,13 @@ def compress_dechirped(
 ) -> Tensor:
     """Compress dechirped pulses in range.
 
+    >>> import torch
+    >>> from torchsar import focus, radar
+    >>> ladar = radar.InverseRadar(193.4e12, bandwidth_hz=150e9, prf_hz=2000.0, pulse_s=1e-4)
+    >>> beat = torch.exp(-2j * torch.pi * 3 * torch.arange(32) / 32)[None]
+    >>> int(focus.compress_dechirped(beat, ladar).abs().argmax()) - 32 // 2
+    3
+
     Of n samples, fast-time sample i lies (i - n // 2) pulse_s / n from the middle of the pulse, and
     range sample i at (i - n // 2) range_step_m from the reference range. Where a velocity v is
     given, the phase 2 pi (2 v / c) (f0 t' + gamma t'^2) that it causes within the pulse is removed
@@ -179,6 +186,14 @@ class CompressDechirped(Stage):
 
 class AzimuthTransform(Stage):
     """Stage that transforms range-compressed pulses of a rotating target into an image.
+
+    >>> import torch
+    >>> from torchsar import Signal, focus, radar
+    >>> ladar = radar.InverseRadar(193.4e12, bandwidth_hz=150e9, prf_hz=2e3, rotation_rad_s=0.005)
+    >>> pulses = Signal(torch.ones(64, 32) + 0j, ladar.raw_axes(64, 32))
+    >>> image = focus.AzimuthTransform(ladar)(pulses)
+    >>> image.names, float(image.data[32, 0].abs())
+    (('azimuth', 'range'), 8.0)
 
     The azimuth axis is cross range, or Doppler where the radar has no rotation rate.
 

@@ -26,6 +26,11 @@ def power(image: Tensor) -> Tensor:
 def multilook(image: Tensor, looks: tuple[int, int]) -> Tensor:
     """Average the power over blocks of (azimuth, range) samples.
 
+    >>> import torch
+    >>> from torchsar.focus import multilook
+    >>> multilook(torch.tensor([[1.0, 3.0, 5.0, 7.0], [1.0, 3.0, 9.0, 7.0]]), looks=(2, 2))
+    tensor([[2., 7.]])
+
     Rows and columns that fill no whole block are dropped. Differentiable.
 
     Args:
@@ -70,6 +75,12 @@ def _refuse_unsquarable(image: Tensor) -> None:
 def amplitude(image: Tensor, looks: tuple[int, int] = (1, 1)) -> Tensor:
     """Compute the amplitude of an image: the square root of the mean power of blocks of samples.
 
+    >>> import torch
+    >>> from torchsar.focus import amplitude
+    >>> amplitude(torch.full((4, 6), 3 + 4j), looks=(2, 3))
+    tensor([[5., 5.],
+            [5., 5.]])
+
     Complex images are divided by their level before squaring and multiplied by it afterwards, so
     that very large or small values neither overflow nor underflow.
 
@@ -93,6 +104,12 @@ def amplitude(image: Tensor, looks: tuple[int, int] = (1, 1)) -> Tensor:
 
 def to_db(power_: Tensor, floor_db: float = -120.0, reference: Tensor | None = None) -> Tensor:
     """Convert power to decibels relative to a reference, 10 log10(power / reference).
+
+    >>> import torch
+    >>> from torchsar.focus import to_db
+    >>> to_db(torch.tensor([[1.0, 0.1], [0.01, 0.0]]))
+    tensor([[   0.,  -10.],
+            [ -20., -120.]])
 
     Args:
         power_: Power, shape (..., azimuth, range).
@@ -138,6 +155,13 @@ def _looked(axis: Axis, looks: int) -> Axis:
 
 class Detect(Stage):
     """Stage that computes the amplitude of a focused image, see `amplitude`.
+
+    >>> import torch
+    >>> from torchsar import Axis, Signal, focus
+    >>> axes = (Axis("azimuth", 4, 0.0, 1.0, "m"), Axis("range", 6, 0.0, 1.0, "m"))
+    >>> image = focus.Detect(looks=(2, 3))(Signal(torch.full((4, 6), 3 + 4j), axes))
+    >>> image.data.tolist(), [axis.step for axis in image.axes]
+    ([[5.0, 5.0], [5.0, 5.0]], [2.0, 3.0])
 
     The samples of a real image are amplitudes, such as those of an earlier `Detect`.
 
@@ -187,6 +211,13 @@ class Detect(Stage):
 
 class QuickLook(Stage):
     """Stage that makes an amplitude picture of limited size with cells nearly square in metres.
+
+    >>> import torch
+    >>> from torchsar import Axis, Signal, focus
+    >>> axes = (Axis("azimuth", 400, 0.0, 1.0, "m"), Axis("range", 60, 0.0, 2.0, "m"))
+    >>> picture = focus.QuickLook(size=100)(Signal(torch.ones(400, 60) + 0j, axes))
+    >>> picture.data.shape, [axis.step for axis in picture.axes]
+    (torch.Size([100, 30]), [4.0, 4.0])
 
     The samples of a real image are amplitudes, such as those of `Detect`.
 

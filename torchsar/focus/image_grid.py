@@ -48,6 +48,13 @@ def level_plane(
 class ImageGrid:
     """Pixels of a plane or of the ground above it, in local Cartesian coordinates.
 
+    >>> import torch
+    >>> from torchsar import focus
+    >>> origin_m, axes = torch.zeros(3).double(), torch.eye(2, 3).double()
+    >>> grid = focus.ImageGrid(origin_m, axes, counts=(3, 4), step_m=0.5)
+    >>> grid.pixels_m().shape, grid.pixels_m()[2, 3].tolist()
+    (torch.Size([3, 4, 3]), [1.0, 1.5, 0.0])
+
     Pixel (i, j) lies at origin_m + step_m (i axes[0] + j axes[1]) + height_m[i, j] n, where n =
     axes[0] x axes[1] is the normal. Images are differentiable in the heights.
 

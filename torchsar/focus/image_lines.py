@@ -110,6 +110,13 @@ def cross_range_of(
 class DopplerLines:
     """Image lines at equal steps of Doppler.
 
+    >>> import torch
+    >>> from torchsar import focus
+    >>> lines = focus.DopplerLines(oversampling=2.0, lines=16)
+    >>> pulses = torch.ones(64, 3, dtype=torch.complex64)
+    >>> focus.matched_fourier(pulses, torch.zeros(0), prf_hz=100.0, lines=lines).shape
+    torch.Size([16, 3])
+
     Doppler zero is line n // 2 of n lines. Every trial has the same Doppler axis.
 
     Args:
@@ -155,6 +162,14 @@ class DopplerLines:
 @dataclass(frozen=True)
 class CrossRangeLines:
     """Image lines at equal steps of cross range in metres, the same axis for all trials.
+
+    >>> import torch
+    >>> from torchsar import focus
+    >>> lines = focus.CrossRangeLines(step_m=0.5, count=21, omega_rad_s=0.02, wavelength_m=0.03)
+    >>> point = torch.exp(-4j * torch.pi / 0.03 * 2.0 * 0.02 * torch.arange(64)[:, None] / 100.0)
+    >>> image = focus.matched_fourier(point, torch.zeros(0), 100.0, lines=lines)
+    >>> (int(image.abs().argmax()) - 21 // 2) * 0.5
+    2.0
 
     Line i lies at (i - count // 2) step_m.
 

@@ -27,6 +27,13 @@ def ladar_limits(
 ) -> tuple[Limit, ...]:
     """List the limits of the velocity estimators of a triangular ladar for motion within bounds.
 
+    >>> from torchsar import focus, radar
+    >>> ladar = radar.TriangularLadar(carrier_hz=193.4e12, bandwidth_hz=5e9, period_s=16e-6,
+    ...     sample_rate_hz=4e6, speed_m_s=60.0, reference_range_m=3000.0)
+    >>> rows = focus.ladar_limits(ladar, 4096, ranges_m=(-0.1, 0.1), speed_m_s=1.0, snr_db=0.0)
+    >>> [(row.name, row.verdict) for row in rows if not row.ok]
+    [('speed of the mirror tone', 'refuse'), ('accumulated phase error', 'warn')]
+
     Limits that need `snr_db` or `spacing_m` are left out where these are None. The bias of each
     velocity estimate due to jerk, jerk x period^2 / 27, is compared with the standard deviation of
     the estimate due to noise, or with 1 mm/s where `snr_db` is None. With a period of 16 us, a
@@ -207,6 +214,13 @@ def ladar_requirements(
     tolerance_rad: float = 0.1,
 ) -> tuple[Requirement, ...]:
     """List the largest phase that each simplification neglects for a triangular ladar.
+
+    >>> from torchsar import focus, radar
+    >>> ladar = radar.TriangularLadar(carrier_hz=193.4e12, bandwidth_hz=5e9, period_s=16e-6,
+    ...     sample_rate_hz=4e6, speed_m_s=60.0, reference_range_m=3000.0)
+    >>> rows = focus.ladar_requirements(ladar, 4096, ranges_m=(-0.1, 0.1), speed_m_s=0.1)
+    >>> [row.effect for row in rows if not row.ok]
+    ['one range per sweep', 'one range per period', 'carrier for f(u) in compensation']
 
     The simplifications are those of the echo model, such as one range per sweep, and those of the
     motion compensation. Two errors are given for the whole record: that of ignoring the flight

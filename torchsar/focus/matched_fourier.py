@@ -66,6 +66,13 @@ def range_phase(
 ) -> Tensor:
     """Remove the phase that the range of a scatterer adds during the rotation.
 
+    >>> import torch
+    >>> from torchsar.focus import range_phase
+    >>> pulses, range_m = torch.ones(3, 2, dtype=torch.complex64), torch.tensor([0.0, 1.0]).double()
+    >>> out = range_phase(pulses, range_m, 0.03, prf_hz=1.0, omega_rad_s=0.05, k=torch.zeros(0))
+    >>> out[1:, 1].angle().round(decimals=2)
+    tensor([-0.5200, -2.0900])
+
     Multiplies range sample n by exp(-2j pi (y_n + yc) (Om phi)^2 / wavelength), where Om phi(t) is
     the rotation angle with the warp phi(t). Use it before `matched_fourier`. Differentiable in all
     arguments except `range_m`.
@@ -115,6 +122,13 @@ def matched_fourier(
 ) -> Tensor:
     """Form the image of a target with non-uniform rotation by a Fourier transform over its angle.
 
+    >>> import torch
+    >>> from torchsar.focus import matched_fourier
+    >>> t, k = torch.arange(64) / 100.0, torch.tensor([1.0])
+    >>> point = torch.exp(-2j * torch.pi * 20 * (t + k * t**2 / 2))[:, None]
+    >>> [round(float(matched_fourier(point, k, 100.0).abs().max()), 1) for k in (0 * k, k)]
+    [3.3, 7.9]
+
     The rotation angle is proportional to the warp. Where the target is deeper in range than the
     depth of focus, 2 (cross-range resolution)^2 / wavelength, first remove the phase of the range
     with `range_phase`. Differentiable in the data, the warp and the rotation rate of
@@ -159,6 +173,13 @@ def matched_fourier(
 
 class MatchedFourierOperator:
     """Linear map of `matched_fourier` for one warp per trial, with its exact adjoint.
+
+    >>> import torch
+    >>> from torchsar import focus
+    >>> operator = focus.MatchedFourierOperator(torch.tensor([1.0]), n_pulse=64, prf_hz=100.0)
+    >>> image = operator.image(torch.ones(64, 3, dtype=torch.complex64))
+    >>> image.shape, operator.adjoint(image).shape
+    (torch.Size([128, 3]), torch.Size([64, 3]))
 
     The tables of the transform do not depend on the data. They are computed once, at construction.
 

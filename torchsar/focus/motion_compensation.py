@@ -81,6 +81,16 @@ _EPS = {torch.complex64: 1e-5, torch.complex128: 1e-11}
 class MotionCompensation:
     """Motion compensation and omega-K imaging of one nearly straight path.
 
+    >>> import torch
+    >>> from torchsar import focus, radar
+    >>> place_m = torch.tensor([[-300.0, 0.2 * y, 100.0] for y in range(-80, 80)]).double()
+    >>> grid = focus.ImageGrid(torch.tensor([-4.0, -4.0, 0.0]).double(), torch.eye(2, 3).double(),
+    ...     counts=(17, 17), step_m=0.5)
+    >>> antennas = radar.AntennaPath(place_m, None, 2 * place_m.norm(dim=-1))
+    >>> divmod(int(focus.MotionCompensation(9.6e9 + 1e7 * torch.arange(16).double(), antennas, grid,
+    ...     focus.ProcessedBeam(3.0)).image(torch.ones(160, 16) + 0j).abs().argmax()), 17)
+    (8, 8)
+
     The geometry is computed once, for any number of histories, whose phases are those of
     `backproject`. Differentiable in the histories.
 
@@ -420,6 +430,17 @@ def compensated_omega_k(
     order: int = 2,
 ) -> Tensor:
     """Form the image of one antenna on a nearly straight path by motion compensation and omega-K.
+
+    >>> import torch
+    >>> from torchsar import focus
+    >>> place_m = torch.tensor([[-300.0, 0.2 * y, 100.0] for y in range(-80, 80)]).double()
+    >>> grid = focus.ImageGrid(torch.tensor([-4.0, -4.0, 0.0]).double(), torch.eye(2, 3).double(),
+    ...     counts=(17, 17), step_m=0.5)
+    >>> image = focus.compensated_omega_k(
+    ...     torch.ones(160, 16) + 0j, 9.6e9 + 1e7 * torch.arange(16).double(), place_m,
+    ...     2 * place_m.norm(dim=-1), grid, focus.ProcessedBeam(3.0))
+    >>> divmod(int(image.abs().argmax()), 17)
+    (8, 8)
 
     It takes a fraction of the time of tiles, with the error that `MotionCompensation.predicted_db`
     predicts; `image_tiles` serves any path. Differentiable in the history.

@@ -360,6 +360,12 @@ def cropped(x: Tensor, n: int, dim: int = -1) -> Tensor:
 def nufft_type2(x: Tensor, points: Tensor, eps: float = 1e-6) -> Tensor:
     """Evaluate the spectrum of uniform samples at any frequencies.
 
+    >>> import torch
+    >>> from torchsar.focus import nufft_type2
+    >>> points = torch.tensor([0.0, 0.125, 0.5], dtype=torch.float64)
+    >>> nufft_type2(torch.ones(8, dtype=torch.complex64), points).abs().round(decimals=3)
+    tensor([8., 0., 0.])
+
     At the point p it is sum_j x_j exp(-2j pi p (j - n//2)). Differentiable in samples and points.
 
     Args:
@@ -382,6 +388,12 @@ def nufft_type2(x: Tensor, points: Tensor, eps: float = 1e-6) -> Tensor:
 
 def nufft_type1(y: Tensor, points: Tensor, n: int, eps: float = 1e-6) -> Tensor:
     """Sum values at arbitrary points into uniform samples, the adjoint of `nufft_type2`.
+
+    >>> import torch
+    >>> from torchsar.focus import nufft_type1
+    >>> points = torch.tensor([0.0, 0.125], dtype=torch.float64)
+    >>> nufft_type1(torch.ones(2, dtype=torch.complex64), points, n=8).abs().round(decimals=3)
+    tensor([0.0000, 0.7650, 1.4140, 1.8480, 2.0000, 1.8480, 1.4140, 0.7650])
 
     The samples are x_j = sum_k y_k exp(+2j pi p_k (j - n//2)), j = 0..n-1. Differentiable in values
     and points.

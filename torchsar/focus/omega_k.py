@@ -426,6 +426,14 @@ class Focuser(Stage):
 class OmegaK(Focuser):
     """Stage that focuses stripmap data by omega-K without Stolt interpolation, see `omega_k`.
 
+    >>> from torchsar import Draws, echo, focus, radar, scene
+    >>> sensor = radar.StripmapRadar(carrier_hz=3.2e9, pulse=radar.LinearFM(40e6, 0.5e-6),
+    ...     sampling_hz=48e6, prf_hz=400.0, velocity_m_s=120.0, near_range_m=4000.0)
+    >>> world = scene.StripmapWorld(scene.Points([0.0], [0.0]), scene.Dwell(0.2))
+    >>> recording, _ = echo.simulate(sensor, world, n_pulse=128, n_range=96, draws=Draws(1))
+    >>> divmod(int(focus.OmegaK(sensor)(recording.signal).data.abs().argmax()), 96)
+    (64, 36)
+
     Arguments as in its base class `Focuser`.
     """
 

@@ -37,6 +37,10 @@ _HELD = 0.8
 class PathImage(Stage):
     """Base class of the stages that image the ground from range profiles along any path.
 
+    >>> from torchsar import focus
+    >>> focus.PathImage(azimuth_m=20.0, range_m=10.0, step_m=0.5).grid.counts
+    (41, 21)
+
     The image has the axes ("azimuth", "range"), in metres on a horizontal plane. A chain connects
     the side data of the recording; without `receiver_m` both antennas are at `transmitter_m`:
 
@@ -318,6 +322,16 @@ def last_image(stages: Iterable[object]) -> PathImage | None:
 class TileImage(PathImage):
     """Stage that images any path by tiles, see `TilePlan`; arguments as in `PathImage`.
 
+    >>> from torchsar import Draws, echo, focus, radar, scene
+    >>> sensor = radar.InverseRadar(carrier_hz=9.6e9, bandwidth_hz=160e6, prf_hz=40.0)
+    >>> world = scene.PathWorld(scene.Points([0.0], [0.0]),
+    ...     scene.Flight(scene.StraightPath((-300.0, -10.0, 100.0), (0.0, 20.0, 0.0))))
+    >>> recording, _ = echo.simulate_path(sensor, world, 40, 16, Draws(1))
+    >>> image = focus.TileImage(8.0, 8.0, 0.5)(recording.signal,
+    ...     *(recording.aux[x] for x in ("frequency_hz", "transmitter_m", "path_reference_m")))
+    >>> divmod(int(image.data.abs().argmax()), 17)
+    (8, 8)
+
     Args:
         azimuth_m: Extent of the image along its azimuth axis in metres.
         range_m: Extent along its range axis in metres.
@@ -375,6 +389,16 @@ class TileImage(PathImage):
 class DirectImage(PathImage):
     """Stage that images any path by the direct sum, see `backproject`: slow and exact.
 
+    >>> from torchsar import Draws, echo, focus, radar, scene
+    >>> sensor = radar.InverseRadar(carrier_hz=9.6e9, bandwidth_hz=160e6, prf_hz=40.0)
+    >>> world = scene.PathWorld(scene.Points([0.0], [0.0]),
+    ...     scene.Flight(scene.StraightPath((-300.0, -10.0, 100.0), (0.0, 20.0, 0.0))))
+    >>> recording, _ = echo.simulate_path(sensor, world, 40, 16, Draws(1))
+    >>> image = focus.DirectImage(8.0, 8.0, 0.5)(recording.signal,
+    ...     *(recording.aux[x] for x in ("frequency_hz", "transmitter_m", "path_reference_m")))
+    >>> divmod(int(image.data.abs().argmax()), 17)
+    (8, 8)
+
     Arguments as in `PathImage`.
     """
 
@@ -397,6 +421,16 @@ class DirectImage(PathImage):
 
 class OmegaKImage(PathImage):
     """Stage that images nearly straight paths by motion compensation and omega-K.
+
+    >>> from torchsar import Draws, echo, focus, radar, scene
+    >>> sensor = radar.InverseRadar(carrier_hz=9.6e9, bandwidth_hz=160e6, prf_hz=100.0)
+    >>> world = scene.PathWorld(scene.Points([0.0], [0.0]),
+    ...     scene.Flight(scene.StraightPath((-300.0, -16.0, 100.0), (0.0, 20.0, 0.0))))
+    >>> recording, _ = echo.simulate_path(sensor, world, 160, 16, Draws(1))
+    >>> image = focus.OmegaKImage(8.0, 8.0, 0.5, beam_deg=3.0)(recording.signal,
+    ...     *(recording.aux[x] for x in ("frequency_hz", "transmitter_m", "path_reference_m")))
+    >>> divmod(int(image.data.abs().argmax()), 17)
+    (8, 8)
 
     See `compensated_omega_k`. Only pulses that see a pixel within the processed beam contribute to
     it.

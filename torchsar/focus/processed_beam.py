@@ -18,6 +18,12 @@ from torchsar.radar import StraightTrack
 class ProcessedBeam:
     """Angles ahead of broadside that are processed, with raised-cosine edges.
 
+    >>> import torch
+    >>> from torchsar import focus
+    >>> beam = focus.ProcessedBeam(width_deg=6.0)
+    >>> beam.weight(torch.tensor([0.0, 1.5, 3.0, 4.5]).deg2rad().sin()).round(decimals=3)
+    tensor([1.0000, 1.0000, 0.5000, 0.0000])
+
     Args:
         width_deg: Width between half weights in degrees.
         squint_deg: Angle of the middle ahead of broadside in degrees.

@@ -97,6 +97,14 @@ def range_compress(raw: Tensor, reference: Tensor) -> Tensor:
 class RangeCompress(Stage):
     """Stage that compresses pulses in range with the transmitted pulse.
 
+    >>> from torchsar import Draws, echo, focus, radar, scene
+    >>> sensor = radar.StripmapRadar(carrier_hz=3.2e9, pulse=radar.LinearFM(40e6, 0.5e-6),
+    ...     sampling_hz=48e6, prf_hz=400.0, velocity_m_s=120.0, near_range_m=4000.0)
+    >>> world = scene.StripmapWorld(scene.Points([0.0], [0.0]), scene.Dwell(0.2))
+    >>> recording, _ = echo.simulate(sensor, world, n_pulse=128, n_range=96, draws=Draws(1))
+    >>> int(focus.RangeCompress(sensor)(recording.signal).data[64].abs().argmax())
+    36
+
     Samples closer to the end of a line than one pulse length are compressed with the recorded part
     of their echo.
 

@@ -289,6 +289,13 @@ def requirements(
 ) -> tuple[Requirement, ...]:
     """List the largest phase that each simplification of a focuser neglects in a stripmap scene.
 
+    >>> from torchsar import focus, radar
+    >>> sensor = radar.StripmapRadar(carrier_hz=3.2e9, pulse=radar.LinearFM(40e6, 0.5e-6),
+    ...     sampling_hz=48e6, prf_hz=400.0, velocity_m_s=120.0, near_range_m=4000.0)
+    >>> rows = focus.requirements(sensor, sensor.raw_axes(1024, 256))
+    >>> [row.effect for row in rows if not row.ok]
+    ['bulk + refocus (omega_k)', 'parabolic range history', 'velocity wrong by 1 m/s']
+
     A range shift is also given as its phase at the ends of the range band; a quarter of a range
     resolution cell is a phase of pi/4. Warns where the PRF is below the Doppler band of a target.
 

@@ -83,6 +83,15 @@ def backproject_spotlight(
 ) -> Tensor:
     """Form the image of ground points by exact backprojection of spotlight or turntable data.
 
+    >>> import torch
+    >>> from torchsar import focus, radar
+    >>> geometry = radar.FarField.turntable(
+    ...     1e10 + 2e7 * torch.arange(32).double(), 0.01 * torch.arange(16).double())
+    >>> profiles = radar.range_profiles(torch.ones(16, 32) + 0j)
+    >>> x_m, y_m = torch.tensor([0.0, 3.0]).double(), torch.zeros(2).double()
+    >>> focus.backproject_spotlight(profiles, geometry, x_m, y_m).abs().round()
+    tensor([512.,   3.])
+
         image = sum_k sum_f s_k(f) exp(+4j pi f r_k / c),
 
     where s_k(f) is the sample of pulse k at frequency f and r_k the range of the pixel in pulse k.
@@ -254,6 +263,16 @@ class GroundImager(Stage):
 
 class SpotlightBackprojection(GroundImager):
     """Stage that images the ground plane by backprojection with exact ranges.
+
+    >>> import torch
+    >>> from torchsar import Signal, focus, radar
+    >>> geometry = radar.FarField.turntable(
+    ...     1e10 + 2e7 * torch.arange(32).double(), 0.01 * torch.arange(16).double())
+    >>> signal = Signal(radar.range_profiles(torch.ones(16, 32) + 0j),
+    ...     radar.InverseRadar(1.032e10, 6.4e8, 100.0).raw_axes(16, 32))
+    >>> image = focus.SpotlightBackprojection(extent_m=8.0, step_m=0.5, geometry=geometry)(signal)
+    >>> divmod(int(image.data.abs().argmax()), 17)
+    (8, 8)
 
     The exact reference for `PolarFormat`; arguments as in `GroundImager`.
     """

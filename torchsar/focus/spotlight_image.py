@@ -96,6 +96,15 @@ def scene_grid(frequency_hz: Tensor, antennas: AntennaPath, corners_m: Tensor | 
 class SpotlightImage(TileImage):
     """Stage that images a recording by tiles on a grid that follows from its geometry.
 
+    >>> from torchsar import Draws, echo, focus, radar, scene
+    >>> sensor = radar.InverseRadar(carrier_hz=9.6e9, bandwidth_hz=160e6, prf_hz=40.0)
+    >>> world = scene.PathWorld(scene.Points([0.0], [0.0]),
+    ...     scene.Flight(scene.StraightPath((-300.0, -10.0, 100.0), (0.0, 20.0, 0.0))))
+    >>> recording, _ = echo.simulate_path(sensor, world, 40, 16, Draws(1))
+    >>> image = focus.SpotlightImage(recording.aux, 8.0, 8.0, 0.5)(recording.signal)
+    >>> divmod(int(image.data.abs().argmax()), 17)
+    (8, 8)
+
     The geometry is that of the side data of the recording; values that a chain connects replace it,
     such as a corrected path:
 

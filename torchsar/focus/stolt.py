@@ -141,6 +141,14 @@ def omega_k_stolt(
 class OmegaKStolt(Focuser):
     """Stage that focuses by omega-K with Stolt interpolation; arguments as in `Focuser`.
 
+    >>> from torchsar import Draws, echo, focus, radar, scene
+    >>> sensor = radar.StripmapRadar(carrier_hz=3.2e9, pulse=radar.LinearFM(40e6, 0.5e-6),
+    ...     sampling_hz=48e6, prf_hz=400.0, velocity_m_s=120.0, near_range_m=4000.0)
+    >>> world = scene.StripmapWorld(scene.Points([0.0], [0.0]), scene.Dwell(0.2))
+    >>> recording, _ = echo.simulate(sensor, world, n_pulse=128, n_range=96, draws=Draws(1))
+    >>> divmod(int(focus.OmegaKStolt(sensor)(recording.signal).data.abs().argmax()), 96)
+    (64, 36)
+
     At a large squint the image can have several lines per pulse, see `omega_k_stolt`.
     """
 

@@ -140,6 +140,15 @@ class InvertibleOmegaK:
 class StoredOmegaK(Stage):
     """Stage that focuses many recordings of one geometry with filters built once.
 
+    >>> from torchsar import Draws, echo, focus, radar, scene
+    >>> sensor = radar.StripmapRadar(carrier_hz=3.2e9, pulse=radar.LinearFM(40e6, 0.5e-6),
+    ...     sampling_hz=48e6, prf_hz=400.0, velocity_m_s=120.0, near_range_m=4000.0)
+    >>> world = scene.StripmapWorld(scene.Points([0.0], [0.0]), scene.Dwell(0.2))
+    >>> recording, _ = echo.simulate(sensor, world, n_pulse=128, n_range=96, draws=Draws(1))
+    >>> stored = focus.StoredOmegaK(focus.OmegaK(sensor), recording.signal.axes)
+    >>> divmod(int(stored(recording.signal).data.abs().argmax()), 96)
+    (64, 36)
+
     The stored filters take one complex number per sample of the raw matrix.
 
     Args:

@@ -116,6 +116,12 @@ def reach_lines(
 ) -> tuple[int, int]:
     """Compute the first and last raw line, relative to an image line, that contribute to it.
 
+    >>> from torchsar import focus, radar
+    >>> sensor = radar.StripmapRadar(carrier_hz=3.2e9, pulse=radar.LinearFM(40e6, 0.5e-6),
+    ...     sampling_hz=48e6, prf_hz=400.0, velocity_m_s=120.0, near_range_m=4000.0)
+    >>> focus.reach_lines(sensor, sensor.raw_axes(4096, 96), (0.0, 0.0), band_hz=300.0)
+    (-958, 958)
+
     These are the lines in which the line of sight crosses the Doppler band with its edges, over all
     ranges of the swath and all range frequencies, and the guard of `guard_lines` on either side. At
     a seam of two blocks the image then differs by `seam_db` from one transform of the whole strip,
@@ -165,6 +171,11 @@ def plan_strip(
     shape: tuple[int, ...], reach: tuple[int, int], memory_bytes: int, itemsize: int = 8, multiple: int = 1
 ) -> StripPlan:
     """Divide a strip into blocks that fit a memory limit.
+
+    >>> from torchsar.focus import plan_strip
+    >>> plan = plan_strip((1000, 100), reach=(-20, 20), memory_bytes=3 * 540 * 100 * 8)
+    >>> [(kept.start, kept.stop) for read, kept in plan.blocks]
+    [(0, 500), (500, 1000)]
 
     Three arrays of the size of a block are in memory at once: its raw lines, its image, and the
     image of the previous block.
@@ -293,6 +304,14 @@ def focus_block(
 def write_strip(blocks: Iterator[tuple[slice, Signal]], target: Any) -> None:
     """Write the blocks of `focus_strip` into an array as they are produced.
 
+    >>> import torch
+    >>> from torchsar import Axis, Signal, focus
+    >>> axes = (Axis("azimuth", 2, 0.0, 1.0, "m"), Axis("range", 3, 0.0, 1.0, "m"))
+    >>> image, parts = torch.zeros(4, 3), [Signal(torch.full((2, 3), x), axes) for x in (1.0, 2.0)]
+    >>> focus.write_strip(iter([(slice(0, 2), parts[0]), (slice(2, 4), parts[1])]), image)
+    >>> image[:, 0]
+    tensor([1., 1., 2., 2.])
+
     Args:
         blocks: Image lines of each block and their image, as yielded by `focus_strip`.
         target: Tensor, numpy array or memmap, or zarr array, written as target[..., lines, :].
@@ -308,6 +327,15 @@ FORMS = {"omega_k": OmegaK, "omega_k_stolt": OmegaKStolt, "range_doppler": Range
 
 class FocusStrip(Stage):
     """Stage that focuses stripmap data in overlapping blocks of lines, see `focus_strip`.
+
+    >>> from torchsar import Draws, echo, focus, radar, scene
+    >>> sensor = radar.StripmapRadar(carrier_hz=3.2e9, pulse=radar.LinearFM(40e6, 0.5e-6),
+    ...     sampling_hz=48e6, prf_hz=400.0, velocity_m_s=120.0, near_range_m=4000.0)
+    >>> world = scene.StripmapWorld(scene.Points([0.0], [0.0]), scene.Dwell(0.2))
+    >>> recording, _ = echo.simulate(sensor, world, n_pulse=128, n_range=96, draws=Draws(1))
+    >>> image = focus.FocusStrip(sensor, band_hz=300.0)(recording.signal)
+    >>> divmod(int(image.data.abs().argmax()), 96)
+    (64, 36)
 
     The image differs from that of one transform by `seam_db` at the seams of the blocks. It needs
     the working memory of one block; `torchsar focus` also reads the data and writes the image block

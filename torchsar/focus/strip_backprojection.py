@@ -37,6 +37,17 @@ def backproject_strip(
 ) -> Tensor:
     """Sum the compressed echo coherently over the pulses at the range of each pixel.
 
+    >>> from torchsar import Draws, echo, focus, radar, scene
+    >>> sensor = radar.StripmapRadar(carrier_hz=3.2e9, pulse=radar.LinearFM(40e6, 0.5e-6),
+    ...     sampling_hz=48e6, prf_hz=400.0, velocity_m_s=120.0, near_range_m=4000.0)
+    >>> world = scene.StripmapWorld(scene.Points([0.0], [0.0]), scene.Dwell(0.2))
+    >>> recording, _ = echo.simulate(sensor, world, n_pulse=128, n_range=96, draws=Draws(1))
+    >>> pulse, range_ = recording.signal.axes
+    >>> focus.backproject_strip(recording.signal.data, sensor, pulse.values()[64:128:40] * 120.0,
+    ...     range_.values()[36], doppler_hz=0.0, start_s=pulse.start,
+    ...     reference=focus.RangeCompress(sensor).spectrum(96)).abs().round()
+    tensor([80., 17.])
+
     The range history is the exact hyperbola, computed as the difference from the range at which the
     line of sight of `frame_hz` crosses the pixel; `direct_sum` sums along it. A focused target at
     slant range R has the phase -4 pi R / lambda; its amplitude is the sum over its pulses. Echoes
@@ -142,6 +153,15 @@ class _PixelGeometry:
 
 class Backproject(Focuser):
     """Stage that focuses a patch by backprojection, on the image axes of focusers such as `OmegaK`.
+
+    >>> from torchsar import Draws, echo, focus, radar, scene
+    >>> sensor = radar.StripmapRadar(carrier_hz=3.2e9, pulse=radar.LinearFM(40e6, 0.5e-6),
+    ...     sampling_hz=48e6, prf_hz=400.0, velocity_m_s=120.0, near_range_m=4000.0)
+    >>> world = scene.StripmapWorld(scene.Points([0.0], [0.0]), scene.Dwell(0.2))
+    >>> recording, _ = echo.simulate(sensor, world, n_pulse=128, n_range=96, draws=Draws(1))
+    >>> image = focus.Backproject(sensor, lines=(60, 69), cells=(32, 41))(recording.signal)
+    >>> divmod(int(image.data.abs().argmax()), 9)
+    (4, 4)
 
     Args:
         radar: Radar of the recording.

@@ -15,6 +15,14 @@ from torchsar.radar import FarField, InverseRadar, Spotlight
 class TargetImage(Stage):
     """Stage that forms an image ("azimuth", "range") from range profiles ("pulse", "range").
 
+    >>> import torch
+    >>> from torchsar import Signal, focus, radar
+    >>> ladar = radar.InverseRadar(193.4e12, bandwidth_hz=150e9, prf_hz=2e3, rotation_rad_s=0.005)
+    >>> pulses = Signal(torch.ones(64, 32) + 0j, ladar.raw_axes(64, 32))
+    >>> image = focus.TargetImage(ladar, window="hann")(pulses)
+    >>> image.names, int(image.data[:, 0].abs().argmax())
+    (('azimuth', 'range'), 32)
+
     Where the geometry is known, the image is formed by polar format, otherwise by a Fourier
     transform along pulses (`AzimuthTransform`). The polar image has its range axis along the
     mean line of sight, with range increasing away from the radar. It covers the whole unambiguous

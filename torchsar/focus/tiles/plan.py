@@ -64,6 +64,15 @@ class _Kept(dict):
 class TilePlan:
     """Images of one geometry, as exact as wanted, at several times the speed of the direct sum.
 
+    >>> import torch
+    >>> from torchsar import focus
+    >>> place_m = torch.tensor([[-300.0, 0.5 * y, 100.0] for y in range(-20, 20)]).double()
+    >>> given = (9.6e9 + 1e7 * torch.arange(16).double(), place_m, None, 2 * place_m.norm(dim=-1))
+    >>> grid = focus.ImageGrid(torch.tensor([-4.0, -4.0, 0.0]).double(), torch.eye(2, 3).double(),
+    ...     counts=(17, 17), step_m=0.5)
+    >>> divmod(int(focus.TilePlan(*given, grid).image(torch.ones(40, 16) + 0j).abs().argmax()), 17)
+    (8, 8)
+
     The image is the sum over pulses p and frequencies k
 
         I(x) = sum_p sum_k s[p, k] exp(+2j pi f_k (l_p(x) - l_ref,p) / c),
@@ -405,6 +414,15 @@ def image_tiles(
     weight: Weight | None = None,
 ) -> Tensor:
     """Form the image of a phase history by tiles; see `TilePlan`, which serves several histories.
+
+    >>> import torch
+    >>> from torchsar import focus
+    >>> place_m = torch.tensor([[-300.0, 0.5 * y, 100.0] for y in range(-20, 20)]).double()
+    >>> given = (9.6e9 + 1e7 * torch.arange(16).double(), place_m, None, 2 * place_m.norm(dim=-1))
+    >>> grid = focus.ImageGrid(torch.tensor([-4.0, -4.0, 0.0]).double(), torch.eye(2, 3).double(),
+    ...     counts=(17, 17), step_m=0.5)
+    >>> divmod(int(focus.image_tiles(torch.ones(40, 16) + 0j, *given, grid).abs().argmax()), 17)
+    (8, 8)
 
     Args:
         history: Phase history, shape (..., pulse, frequency), complex.
