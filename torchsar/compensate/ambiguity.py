@@ -210,6 +210,14 @@ def ambiguity_evidence(
 class DopplerCentroid(Stage):
     """Absolute Doppler centroid with its ambiguity and the squint angle; the recommended estimator.
 
+    >>> from torchsar import Draws, compensate, echo, radar, scene
+    >>> strip = radar.StripmapRadar(3e9, radar.LinearFM(40e6, 5e-7), 50e6, 400.0, 120.0, 4000.0)
+    >>> world = scene.StripmapWorld(scene.Points([0], [0]), scene.Dwell(0.5), doppler_hz=450.0)
+    >>> recording, _ = echo.simulate(strip, world, 256, 64, Draws(1))
+    >>> found = compensate.DopplerCentroid(strip, assess=False)(recording.signal)
+    >>> found["doppler_hz"].round(decimals=-1), found["ambiguity"]
+    (tensor(450., dtype=torch.float64), tensor(1., dtype=torch.float64))
+
     The baseband centroid comes from the phase increment between adjacent lines. The ambiguity is
     found without prior knowledge, see `ambiguity_evidence`. Where the data leave it open, it is
     that of the centroid nearest to `pointing_doppler_hz` of the radar, if that is not None. Targets

@@ -285,6 +285,12 @@ def point_doppler(
 ) -> Tensor:
     """Estimate the Doppler of one point at the middle line of its history by maximum likelihood.
 
+    >>> import torch
+    >>> from torchsar.compensate import point_doppler
+    >>> history = torch.exp(0.2j * torch.pi * torch.arange(64))  # a tenth of a cycle per pulse
+    >>> point_doppler(history, prf_hz=1000.0).round(decimals=2)
+    tensor(100., dtype=torch.float64)
+
     The quadratic phase that `rate_hz_s` predicts is removed first. The peak of the zero-padded
     spectrum is then refined by Newton steps. The standard deviation of the result is the Cramer-Rao
     bound of a tone, 0.39 / (T sqrt(q)) in Hz, where T is the length of the history in seconds and q

@@ -47,6 +47,13 @@ Method = Literal["polynomial", "single", "amplitude", "running"]
 def shift_range(data: Tensor, shift_cells: Tensor | float) -> Tensor:
     """Shift every pulse in range, circularly.
 
+    >>> import torch
+    >>> from torchsar.compensate import shift_range
+    >>> pulses = torch.zeros(3, 8, dtype=torch.complex64)
+    >>> pulses[:, 4] = 1
+    >>> shift_range(pulses, torch.tensor([-1.0, 0.0, 2.0])).abs().argmax(-1)
+    tensor([3, 4, 6])
+
     The shift multiplies the range spectrum by a linear phase that is zero in the middle of the
     band. The phase of an echo therefore does not change with its position. Unitary: the shift -s
     reverses the shift s. Differentiable in both arguments.

@@ -35,6 +35,13 @@ def doppler_at(
 ) -> Tensor:
     """Compute the Doppler of a point at a given time from its position in an image.
 
+    >>> import torch
+    >>> from torchsar import compensate, radar
+    >>> strip = radar.StripmapRadar(3e9, radar.LinearFM(40e6, 5e-7), 50e6, 400.0, 120.0, 4000.0)
+    >>> azimuth_m = torch.tensor([0.0, 100.0])  # of two points at a range of 4 km, at time 0
+    >>> compensate.doppler_at(strip, azimuth_m, torch.tensor(4000.0), 0.0, 120.0, 0.0).round()
+    tensor([ 0., 60.])
+
     Exact for a straight path; the inverse of `StripmapRadar.image_position`. All arguments
     broadcast.
 
@@ -149,6 +156,14 @@ def point_history(
 
 class PointDoppler(Stage):
     """Doppler centroid of the beam from the brightest point of an image.
+
+    >>> from torchsar import Draws, compensate, echo, focus, radar, scene
+    >>> strip = radar.StripmapRadar(3e9, radar.LinearFM(40e6, 5e-7), 50e6, 400.0, 120.0, 4000.0)
+    >>> world = scene.StripmapWorld(scene.Points([0.0], [0.0]), scene.Dwell(0.5), doppler_hz=25.0)
+    >>> recording, _ = echo.simulate(strip, world, 256, 64, Draws(1))
+    >>> image = focus.OmegaK(strip)(recording.signal, doppler_hz=0.0)
+    >>> compensate.PointDoppler(strip)(image, frame_hz=0.0)["doppler_hz"].round(decimals=1)
+    tensor(25., dtype=torch.float64)
 
     Provides `doppler_hz` and `doppler_baseband_hz`. Assumes that the beam centre crosses the point
     at `crossing_s`. The image holds each point at the time when its Doppler equals the frame

@@ -122,6 +122,16 @@ def minimum_entropy_velocity(
 ) -> Estimate:
     """Find the velocity of least entropy: a grid search, a refinement, and a parabola.
 
+    >>> from torchsar import Draws, compensate, echo, focus, radar, scene
+    >>> strip = radar.StripmapRadar(3e9, radar.LinearFM(40e6, 5e-7), 50e6, 100.0, 120.0, 4000.0)
+    >>> world = scene.StripmapWorld(scene.Points([0], [0]), scene.Dwell(1.0), velocity_m_s=125.0)
+    >>> raw, truth = echo.simulate(strip, world, 128, 64, Draws(1))
+    >>> group, _ = compensate.EffectiveVelocity(focus.OmegaK(strip)).group(raw.signal.data)
+    >>> compensate.minimum_entropy_velocity(
+    ...     group, truth.values["doppler_hz"], dwell_s=1.0, reach_m_s=20.0, tolerance_m_s=0.1
+    ... )["velocity_m_s"].round()
+    tensor(125., dtype=torch.float64)
+
     The grid has steps of `grid_step_m_s`. Where that would be more than 33 velocities, only the
     middle of the Doppler band is focused at first, with fewer and wider steps. Then the band is
     doubled, and velocities about the best one are searched, until the band is whole.
@@ -235,6 +245,14 @@ def _search(
 
 class EffectiveVelocity(Stage):
     """Effective velocity of least image entropy.
+
+    >>> from torchsar import Draws, compensate, echo, focus, radar, scene
+    >>> strip = radar.StripmapRadar(3e9, radar.LinearFM(40e6, 5e-7), 50e6, 100.0, 120.0, 4000.0)
+    >>> world = scene.StripmapWorld(scene.Points([0], [0]), scene.Dwell(1.0), velocity_m_s=125.0)
+    >>> recording, _ = echo.simulate(strip, world, 128, 64, Draws(1))
+    >>> estimate = compensate.EffectiveVelocity(focus.OmegaK(strip), reach_m_s=20.0, lines=16)
+    >>> estimate(recording.signal)["velocity_m_s"].round()
+    tensor(125., dtype=torch.float64)
 
     Provides `velocity_m_s` and leaves the signal unchanged. In a chain, connect `doppler_hz` to the
     stage that estimates the absolute Doppler centroid. Only lines about the middle of the record

@@ -39,6 +39,13 @@ def bistatic_echo(
 ) -> Tensor:
     """Return the echo of moving points without noise.
 
+    >>> from torchsar import Draws, echo, radar, scene
+    >>> sar = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 1e-6), 60e6, 180.0, 300.0, 5000.0)
+    >>> movers = scene.MovingPoints([0], [0], [0], [6 * sar.range_step_m]).movers(sar, Draws(1))
+    >>> lines = echo.bistatic_echo(movers, sar, 4, 32, gate=scene.BandLimited(1.0))
+    >>> lines.shape, lines[1].abs().argmax(-1)  # sample 16 is the reference range
+    (torch.Size([3, 4, 32]), tensor([22, 22, 22, 22]))
+
     R_T(t) is the range from the transmitter to the scene, and R_m(t) the range from a target to
     receive channel m, at slow time t. The phase of the echo is -2 pi / lambda (R_T(t) - R_T(0) +
     R_m(t) - radar.reference_range_m). Where a target moves towards the transmitter (`movers.bend`),
@@ -164,6 +171,13 @@ def simulate_bistatic(
     device: torch.device | str | None = None,
 ) -> tuple[Recording, Truth]:
     """Simulate a recording of moving targets and a sea, batched over the trials of the draws.
+
+    >>> from torchsar import Draws, echo, radar, scene
+    >>> sar = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 1e-6), 60e6, 180.0, 300.0, 5000.0)
+    >>> world = scene.BistaticWorld(scene.MovingPoints([5], [0], [0], [0]), scene.BandLimited(1.0))
+    >>> recording, truth = echo.simulate_bistatic(sar, world, 4, 32, Draws(1))
+    >>> recording.signal.data.shape, truth.values["u_r_m_s"]  # three channels
+    (torch.Size([3, 4, 32]), tensor([5.], dtype=torch.float64))
 
     Warns of targets that the receive gain (`world.gate`) suppresses at every pulse, so that the
     recording does not contain them.

@@ -47,6 +47,14 @@ def _refuse_delay(recording: Recording, what: str) -> None:
 class ChannelErrors:
     """Impairment: phase, gain and delay of each channel, for signal and noise.
 
+    >>> from torchsar import Draws, echo, radar, scene
+    >>> sar = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 1e-6), 60e6, 180.0, 300.0, 5000.0)
+    >>> world = scene.BistaticWorld(scene.MovingPoints([0], [0], [0], [0]), scene.BandLimited(1.0))
+    >>> errors = {"channels": echo.ChannelErrors(gain_db=[0, 6, 0])}
+    >>> recording, _ = echo.simulate_bistatic(sar, world, 4, None, Draws(1), impairments=errors)
+    >>> recording.signal.data.abs().mean(-1).round(decimals=2)  # of three channels
+    tensor([1., 2., 1.])
+
     Delays shift lines without a change of their carrier phases. Each parameter is a list with one
     entry per channel (numbers, or one value per trial), a tensor of shape (..., channel), or None
     for no error. The truth holds `phase_rad`, `gain_db` and `delay_s`, shape (..., channel) each,
@@ -99,6 +107,14 @@ class ChannelErrors:
 @finite_numbers("clock errors", phase_walk_rad=0.0)
 class SynchronisationError:
     """Impairment: phase and delay of every pulse due to clocks that drift apart.
+
+    >>> from torchsar import Draws, echo, radar, scene
+    >>> sar = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 1e-6), 60e6, 180.0, 300.0, 5000.0)
+    >>> world = scene.BistaticWorld(scene.MovingPoints([0], [0], [0], [0]), scene.BandLimited(1.0))
+    >>> errors = {"clocks": echo.SynchronisationError(phase_rad=[0.5], direct_snr_db=None)}
+    >>> recording, _ = echo.simulate_bistatic(sar, world, 4, None, Draws(1), impairments=errors)
+    >>> recording.aux["direct_path"][:, 32].angle().round(decimals=2)  # at the peak
+    tensor([0.5000, 0.5000, 0.5000, 0.5000])
 
     Both are polynomials and sinusoids of slow time, which is zero at the middle pulse; the phase
     also walks at random from pulse to pulse. The errors are common to all channels. The data are

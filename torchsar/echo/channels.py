@@ -18,6 +18,14 @@ from torchsar.scene.trials import finite_numbers, refuse_other_trials, stacked
 class ChannelImbalance:
     """Impairment: gain and phase of receiver channels that record the lines in turn.
 
+    >>> from torchsar import Draws, echo, radar, scene
+    >>> isar = radar.InverseRadar(1e10, 1e9, 500.0, rotation_rad_s=0.1)
+    >>> world = scene.TurntableWorld(scene.Points([0.0], [0.0]))
+    >>> errors = {"channels": echo.ChannelImbalance(gain=(1, 2), phase_rad=(0, 0))}
+    >>> recording, _ = echo.simulate_turntable(isar, world, 4, 8, Draws(1), errors)
+    >>> recording.signal.data[:, 4].abs().round(decimals=2)  # the range cell of the point
+    tensor([1., 2., 1., 2.])
+
     Line i is multiplied by gain[c] exp(j phase_rad[c]) with c = i modulo the number of channels.
     Even and odd lines are two channels: `ChannelImbalance(gain=(1, 1.2), phase_rad=(0, math.pi /
     3))`. The truth holds `gain` and `phase_rad`, shape (..., channel), float64.

@@ -33,6 +33,14 @@ def dechirped_echo(
 ) -> Tensor:
     """Return dechirped pulses with the range evaluated at every sample, without noise.
 
+    >>> import torch
+    >>> from torchsar import core, echo, radar, scene
+    >>> isar = radar.InverseRadar(1e10, 1e9, 500.0, pulse_s=1e-4)
+    >>> range_m = torch.tensor([3 * isar.range_step_m], dtype=torch.float64)
+    >>> point = scene.Scatterers(0 * range_m, range_m, torch.ones(1, dtype=torch.complex128))
+    >>> core.centred_ifft(echo.dechirped_echo(point, isar, 4, 16, 0.1)).abs().argmax(-1)
+    tensor([11, 11, 11, 11])
+
     At the time t' from the middle of a pulse, the phase of a scatterer is
 
         -2 pi (f0 dtau + gamma t' dtau - gamma dtau^2 / 2),

@@ -23,6 +23,14 @@ from torchsar.scene.trials import finite_numbers, refuse_other_trials, refuse_un
 class Tone:
     """Impairment: a tone that is added to randomly chosen lines.
 
+    >>> from torchsar import Draws, echo, radar, scene
+    >>> strip = radar.StripmapRadar(3e9, radar.LinearFM(40e6, 5e-7), 50e6, 400.0, 120.0, 4000.0)
+    >>> world = scene.StripmapWorld(scene.Points([0.0], [0.0]))
+    >>> errors = {"tone": echo.Tone(over_signal_db=20.0, frequency_hz=5e6, share=0.25)}
+    >>> _, truth = echo.simulate(strip, world, 16, 64, Draws(1), errors)
+    >>> truth.values["tone.contaminated"].sum(), truth.values["tone.frequency_hz"][0]
+    (tensor(4), tensor(5000000., dtype=torch.float64))
+
     The truth holds `contaminated`, shape (..., pulse), bool, true for the lines with the tone, and
     `frequency_hz` at the middle of each line, shape (..., pulse).
 
@@ -92,6 +100,14 @@ class Tone:
 class WideInterferer:
     """Impairment: band-limited noise on randomly chosen lines, independent from line to line.
 
+    >>> from torchsar import Draws, echo, radar, scene
+    >>> strip = radar.StripmapRadar(3e9, radar.LinearFM(40e6, 5e-7), 50e6, 400.0, 120.0, 4000.0)
+    >>> world = scene.StripmapWorld(scene.Points([0.0], [0.0]))
+    >>> errors = {"wide": echo.WideInterferer(20.0, frequency_hz=5e6, bandwidth_hz=2e6, share=0.25)}
+    >>> _, truth = echo.simulate(strip, world, 16, 64, Draws(1), errors)
+    >>> truth.values["wide.contaminated"].sum()
+    tensor(4)
+
     The noise of a line is cut out of a longer periodic process and is therefore not itself
     periodic. The truth holds `contaminated`, shape (..., pulse), bool, true for the lines with this
     noise, and `bandwidth_hz`, shape (...,).
@@ -143,6 +159,14 @@ class WideInterferer:
 @finite_numbers("a converter", rms_levels="positive")
 class Quantiser:
     """Impairment: an I/Q converter behind an automatic gain control, without dither.
+
+    >>> from torchsar import Draws, echo, radar, scene
+    >>> strip = radar.StripmapRadar(3e9, radar.LinearFM(40e6, 5e-7), 50e6, 400.0, 120.0, 4000.0)
+    >>> world = scene.StripmapWorld(scene.Points([0.0], [0.0]), snr_db=10.0)
+    >>> errors = {"converter": echo.Quantiser(bits=2)}
+    >>> recording, _ = echo.simulate(strip, world, 16, 64, Draws(1), errors)
+    >>> len(recording.signal.data.real.unique())
+    4
 
     The output levels are the odd numbers from -(2^bits - 1) to 2^bits - 1; larger samples are
     clipped. In each trial the gain brings the rms value of one component, I or Q, to rms_levels,

@@ -38,6 +38,14 @@ def sample_unevenly(x: Tensor, offset_samples: Tensor) -> Tensor:
 class PeriodicJitter:
     """Impairment: sample n of every line is taken at the instant n + e[n mod M], with M offsets e.
 
+    >>> from torchsar import Draws, echo, radar, scene
+    >>> strip = radar.StripmapRadar(3e9, radar.LinearFM(40e6, 5e-7), 50e6, 400.0, 120.0, 4000.0)
+    >>> world = scene.StripmapWorld(scene.Points([0.0], [0.0]))
+    >>> errors = {"jitter": echo.PeriodicJitter(offset_samples=[0.0, 0.1])}
+    >>> recording, truth = echo.simulate(strip, world, 8, 64, Draws(1), errors)
+    >>> recording.aux["pilot"].shape, truth.values["jitter.offset_samples"]
+    (torch.Size([4096]), tensor([0.0000, 0.1000], dtype=torch.float64))
+
     A pilot tone through the same converter is recorded as aux `pilot`, shape (..., pilot_samples).
     Its phase is random, so that it shows only the differences between the offsets; an offset that
     is common to all samples cannot be estimated from it. Where positions in images are compared,

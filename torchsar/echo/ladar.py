@@ -34,6 +34,15 @@ def ladar_echo(
 ) -> Tensor:
     """Return dechirped sweeps without noise.
 
+    >>> import torch
+    >>> from torchsar import echo, radar, scene
+    >>> ladar = radar.TriangularLadar(1.934e14, 5e9, 16e-6, 16e6, 60.0, 3000.0)
+    >>> range_m = torch.tensor([10 * ladar.range_step_m], dtype=torch.float64)
+    >>> point = scene.Scatterers(0 * range_m, range_m, torch.ones(1, dtype=torch.complex128))
+    >>> torch.fft.fft(echo.ladar_echo(point, ladar, 2)).abs().argmax(-1)  # up-sweeps, down-sweeps
+    tensor([[ 10,  10],
+            [118, 118]])
+
     The phase of a scatterer in cycles is fc dtau +- (K u dtau - K dtau^2 / 2), with + in up-sweeps
     and - in down-sweeps. Here fc is the carrier, K the chirp rate, u the time from the middle of
     the sweep and dtau = 2 RD / c the delay, with the range RD relative to the reference range. This
@@ -300,6 +309,13 @@ def simulate_ladar(
     device: torch.device | str | None = None,
 ) -> tuple[Recording, Truth]:
     """Simulate separated sweeps of a ladar, batched over the trials of the draws.
+
+    >>> from torchsar import Draws, echo, radar, scene
+    >>> ladar = radar.TriangularLadar(1.934e14, 5e9, 16e-6, 16e6, 60.0, 3000.0)
+    >>> world = scene.LadarWorld(scene.Points([0.0], [0.0]), [scene.Polynomial([0.1])])
+    >>> recording, truth = echo.simulate_ladar(ladar, world, n_period=4, draws=Draws(1))
+    >>> recording.signal.data.shape, truth.values["velocity_m_s"].round(decimals=2)
+    (torch.Size([2, 4, 128]), tensor([0.1000, 0.1000, 0.1000, 0.1000], dtype=torch.float64))
 
     Samples are complex whatever radar.detection is, as if an ideal stage had cut the record of the
     receiver into sweeps; `simulate_ladar_record` simulates that record itself.

@@ -301,6 +301,13 @@ def simulate_ladar_record(
 ) -> tuple[Recording, Truth]:
     """Simulate a continuous record of a ladar, batched over the trials of the draws.
 
+    >>> from torchsar import Draws, echo, radar, scene
+    >>> ladar = radar.TriangularLadar(1.934e14, 5e9, 16e-6, 16e6, 60.0, 3000.0)
+    >>> world = scene.LadarWorld(scene.Points([0.0], [0.0]))
+    >>> recording, _ = echo.simulate_ladar_record(ladar, world, n_period=4, draws=Draws(1))
+    >>> recording.signal.names, recording.signal.data.shape
+    (('pulse', 'time'), torch.Size([4, 256]))
+
     The record has one block per recorded period. Samples are complex or real by radar.detection;
     real noise has half the variance, so that the analytic signal has the signal-to-noise ratio of
     complex samples.

@@ -129,6 +129,14 @@ class _Lost:
 class LostLines(_Lost):
     """Impairment: single lines lost at random positions.
 
+    >>> from torchsar import Draws, echo, radar, scene
+    >>> strip = radar.StripmapRadar(3e9, radar.LinearFM(40e6, 5e-7), 50e6, 400.0, 120.0, 4000.0)
+    >>> world = scene.StripmapWorld(scene.Points([0.0], [0.0]))
+    >>> errors = {"lost": echo.LostLines(count=2)}
+    >>> recording, truth = echo.simulate(strip, world, 8, 64, Draws(1), errors)
+    >>> truth.values["lost.lost_number"], recording.aux["line_number"]
+    (tensor([3, 5]), tensor([ 0,  1,  2,  4,  6,  7, -1, -1]))
+
     The truth holds `lost`, shape (..., pulse), bool, indexed by the line number minus the number of
     the first line, and the numbers of the lost lines `lost_number`, shape (..., count), padded with
     -1 where trials lose fewer lines.
@@ -156,6 +164,14 @@ class LostLines(_Lost):
 @dataclass(frozen=True)
 class LostPulses(_Lost):
     """Impairment: whole pulses at random positions that were not received; their samples are zero.
+
+    >>> from torchsar import Draws, echo, radar, scene
+    >>> isar = radar.InverseRadar(1e10, 1e9, 500.0, rotation_rad_s=0.1)
+    >>> world = scene.TurntableWorld(scene.Points([0.0], [0.0]))
+    >>> errors = {"lost": echo.LostPulses(fraction=0.25)}
+    >>> recording, _ = echo.simulate_turntable(isar, world, 8, 8, Draws(1), errors)
+    >>> recording.signal.data[:, 4].abs().round(decimals=2)  # the range cell of the point
+    tensor([0., 1., 1., 1., 1., 1., 0., 1.])
 
     All other pulses keep their positions, as where a trigger counts the pulses. (`LostLines` is the
     impairment in which later lines move up instead.) The true value `present`, shape (..., pulse),
@@ -186,6 +202,14 @@ class LostPulses(_Lost):
 @dataclass(frozen=True)
 class LostGaps:
     """Impairment: gaps of consecutive lost lines, with at least one received line between gaps.
+
+    >>> from torchsar import Draws, echo, radar, scene
+    >>> strip = radar.StripmapRadar(3e9, radar.LinearFM(40e6, 5e-7), 50e6, 400.0, 120.0, 4000.0)
+    >>> world = scene.StripmapWorld(scene.Points([0.0], [0.0]))
+    >>> errors = {"gap": echo.LostGaps(count=1, length=3)}
+    >>> recording, truth = echo.simulate(strip, world, 8, 64, Draws(1), errors)
+    >>> truth.values["gap.lost_number"], recording.aux["line_number"]
+    (tensor([3, 4, 5]), tensor([ 0,  1,  2,  6,  7, -1, -1, -1]))
 
     The truth holds `lost`, shape (..., pulse), bool, indexed by the line number minus the number of
     the first line, and the numbers of the lost lines `lost_number`, shape (..., count * length).
@@ -228,6 +252,14 @@ class LostGaps:
 class RepeatedLines:
     """Impairment: lines that appear twice in succession, with the same number and samples.
 
+    >>> from torchsar import Draws, echo, radar, scene
+    >>> strip = radar.StripmapRadar(3e9, radar.LinearFM(40e6, 5e-7), 50e6, 400.0, 120.0, 4000.0)
+    >>> world = scene.StripmapWorld(scene.Points([0.0], [0.0]))
+    >>> errors = {"repeated": echo.RepeatedLines(count=1)}
+    >>> recording, _ = echo.simulate(strip, world, 8, 64, Draws(1), errors)
+    >>> recording.aux["line_number"]
+    tensor([0, 0, 1, 2, 3, 4, 5, 6])
+
     The recording keeps its number of lines: as many lines (or padding) at its end are dropped as
     lines are repeated. The truth holds `repeated`, shape (..., pulse), bool, true for the second
     copy of each repeated line in the impaired recording.
@@ -267,6 +299,14 @@ class RepeatedLines:
 @dataclass(frozen=True)
 class CorruptedNumbers:
     """Impairment: line numbers that are overwritten, while the samples are unchanged.
+
+    >>> from torchsar import Draws, echo, radar, scene
+    >>> strip = radar.StripmapRadar(3e9, radar.LinearFM(40e6, 5e-7), 50e6, 400.0, 120.0, 4000.0)
+    >>> world = scene.StripmapWorld(scene.Points([0.0], [0.0]))
+    >>> errors = {"numbers": echo.CorruptedNumbers(count=2, bits=4)}
+    >>> recording, truth = echo.simulate(strip, world, 16, 64, Draws(1), errors)
+    >>> (recording.aux["line_number"] != truth.values["numbers.true_number"]).sum()
+    tensor(2)
 
     The truth holds, for each line of the recording, `corrupted`, bool, and `true_number`, shape
     (..., pulse) each.

@@ -30,6 +30,14 @@ def path_echo(
 ) -> Tensor:
     """Compute the phase history of points along any path.
 
+    >>> import torch
+    >>> from torchsar import echo, radar
+    >>> sar = radar.InverseRadar(1e10, 1e8, 100.0)
+    >>> place_m, points_m = torch.tensor([[-800.0, 0, 600]]).double(), torch.zeros(2, 3).double()
+    >>> antennas = radar.AntennaPath(place_m, None, 2 * place_m.norm(dim=-1))  # one pulse
+    >>> echo.path_echo(antennas, points_m, torch.ones(1, 2), sar, 4).abs().round(decimals=2)
+    tensor([[2., 2., 2., 2.]])
+
     The sample of pulse p at the frequency f is the sum over the points of weight exp(-2j pi f (l -
     reference) / c) with the path l = |transmitter - x| + |x - receiver|. Antennas are at rest
     during a pulse. The sum is a matrix product over blocks of frequencies (`echo_spectrum`).
@@ -99,6 +107,14 @@ def simulate_path(
     device: torch.device | str | None = None,
 ) -> tuple[Recording, Truth]:
     """Simulate range profiles along any path, one recording per trial of `draws`.
+
+    >>> from torchsar import Draws, echo, radar, scene
+    >>> sar = radar.InverseRadar(1e10, 1e8, 100.0)
+    >>> track = scene.StraightPath([-800.0, 0.0, 600.0], [0.0, 50.0, 0.0])
+    >>> world = scene.PathWorld(scene.Points([0.0], [0.0]), scene.Flight(track))
+    >>> recording, truth = echo.simulate_path(sar, world, n_pulse=4, n_range=8, draws=Draws(1))
+    >>> recording.signal.data.abs().argmax(-1), recording.aux["transmitter_m"].shape
+    (tensor([4, 4, 4, 4]), torch.Size([4, 3]))
 
     Profiles are those of pulses after range compression, or of dechirped sweeps without their video
     phase.
@@ -218,6 +234,14 @@ def _line_of_sight_m(recorded: AntennaPath, true: AntennaPath, strip: bool = Fal
 @dataclass(frozen=True)
 class PathError:
     """Impairment: errors of the positions that navigation records.
+
+    >>> from torchsar import Draws, echo, radar, scene
+    >>> sar = radar.InverseRadar(1e10, 1e8, 100.0)
+    >>> track = scene.StraightPath([-800.0, 0.0, 600.0], [0.0, 50.0, 0.0])
+    >>> world = scene.PathWorld(scene.Points([0.0], [0.0]), scene.Flight(track))
+    >>> errors = {"height": echo.PathError(scene.Sway(z=[scene.Offset(0.1)]))}
+    >>> echo.simulate_path(sar, world, 4, 8, Draws(1), errors)[1].values["height.line_of_sight_m"]
+    tensor([0.0600, 0.0600, 0.0600, 0.0600], dtype=torch.float64)
 
     It works on simulated and on recorded data with the side data of `AntennaPath.side_data`. The
     radar keeps the middle of the scene in its window as navigation says: the reference of the

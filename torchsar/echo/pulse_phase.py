@@ -27,6 +27,14 @@ def _turned(recording: Recording, phase_rad: Tensor) -> tuple[Recording, Mapping
 class WhitePhase:
     """Impairment: an independent phase of each pulse, uniform within +-limit_rad.
 
+    >>> from torchsar import Draws, echo, radar, scene
+    >>> isar = radar.InverseRadar(1e10, 1e9, 500.0, rotation_rad_s=0.1)
+    >>> world = scene.TurntableWorld(scene.Points([0.0], [0.0]))
+    >>> errors = {"phase": echo.WhitePhase(limit_rad=0.5)}
+    >>> recording, _ = echo.simulate_turntable(isar, world, 64, 8, Draws(1), errors)
+    >>> recording.signal.data[:, 4].angle().abs().max().round(decimals=1)  # the cell of the point
+    tensor(0.5000)
+
     The truth holds `phase_rad`, shape (..., pulse), float64.
 
     Args:
@@ -50,6 +58,14 @@ class WhitePhase:
 class PhaseWalk:
     """Impairment: a random walk of the phase with normal steps from pulse to pulse.
 
+    >>> from torchsar import Draws, echo, radar, scene
+    >>> isar = radar.InverseRadar(1e10, 1e9, 500.0, rotation_rad_s=0.1)
+    >>> world = scene.TurntableWorld(scene.Points([0.0], [0.0]))
+    >>> errors = {"phase": echo.PhaseWalk(step_rad=0.5)}
+    >>> _, truth = echo.simulate_turntable(isar, world, 1024, 8, Draws(1), errors)
+    >>> truth.values["phase.phase_rad"].diff().std().round(decimals=1)
+    tensor(0.5000, dtype=torch.float64)
+
     The truth holds `phase_rad`, shape (..., pulse), float64.
 
     Args:
@@ -71,6 +87,14 @@ class PhaseWalk:
 @finite_numbers("a phase sinusoid")
 class PhaseSinusoid:
     """Impairment: a sinusoidal phase with a random start, as of a vibration.
+
+    >>> from torchsar import Draws, echo, radar, scene
+    >>> isar = radar.InverseRadar(1e10, 1e9, 500.0, rotation_rad_s=0.1)
+    >>> world = scene.TurntableWorld(scene.Points([0.0], [0.0]))
+    >>> errors = {"phase": echo.PhaseSinusoid(amplitude_rad=2.0)}
+    >>> _, truth = echo.simulate_turntable(isar, world, 64, 8, Draws(1), errors)
+    >>> truth.values["phase.phase_rad"].max().round(decimals=1)
+    tensor(2., dtype=torch.float64)
 
     The truth holds `phase_rad`, shape (..., pulse), float64.
 

@@ -16,6 +16,16 @@ from torchsar.core import Axis, Draws, Recording, Signal, Truth
 class Impairment(Protocol):
     """Impairment of a recording by the receiver or the environment.
 
+    >>> from torchsar import Draws, Recording, echo, radar, scene
+    >>> def halved(recording, draws):
+    ...     signal = recording.signal.with_data(recording.signal.data / 2)
+    ...     return Recording(signal, recording.radar, recording.aux), {}
+    >>> isar = radar.InverseRadar(1e10, 1e9, 500.0, rotation_rad_s=0.1)
+    >>> world = scene.TurntableWorld(scene.Points([0.0], [0.0]))
+    >>> recording, _ = echo.simulate_turntable(isar, world, 4, 8, Draws(1), {"half": halved})
+    >>> recording.signal.data[:, 4].abs().round(decimals=2)  # the range cell of the point
+    tensor([0.5000, 0.5000, 0.5000, 0.5000])
+
     It is called with a recording and random draws, and returns the impaired recording and the true
     values of the impairment by name.
     """
@@ -106,6 +116,14 @@ def apply_impairments(
     recording: Recording, impairments: Mapping[str, Impairment], draws: Draws
 ) -> tuple[Recording, dict[str, Tensor]]:
     """Apply impairments to a recording, simulated or recorded.
+
+    >>> import torch
+    >>> from torchsar import Draws, core, echo, radar
+    >>> isar = radar.InverseRadar(1e10, 1e9, 500.0)
+    >>> pulses = core.Recording(core.Signal(torch.ones(4, 8) + 0j, isar.raw_axes(4, 8)), isar)
+    >>> found, truth = echo.apply_impairments(pulses, {"lost": echo.LostPulses(count=1)}, Draws(1))
+    >>> found.signal.data.abs().mean(-1), truth["lost.present"]
+    (tensor([0., 1., 1., 1.]), tensor([False,  True,  True,  True]))
 
     A recording without the side data `line_number` (in `aux`) gets the line numbers 0, 1, ... in
     the order of its pulses.

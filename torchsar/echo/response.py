@@ -19,6 +19,13 @@ Curve = Callable[[Tensor], Tensor]
 class ChannelResponse:
     """Impairment: every range spectrum is multiplied by amplitude(u) exp(j phase(u)).
 
+    >>> import torch
+    >>> from torchsar import echo
+    >>> response = echo.ChannelResponse(phase_rad=lambda u: 2 * u.square())
+    >>> phase, amplitude = response.curves(torch.tensor([-1.0, -0.5, 0.0]))
+    >>> phase, amplitude
+    (tensor([2.0000, 0.5000, 0.0000]), tensor([1., 1., 1.]))
+
     u is the range frequency divided by half the pulse bandwidth, so that the band is -1..1. Outside
     the band the response has its value at the nearer band edge. Constant and linear parts of the
     phase are applied as well, although no processor can distinguish them from a phase and a shift
@@ -84,6 +91,13 @@ def smooth_response(
     amplitude_ripple_db: Tensor | float = 0.0,
 ) -> ChannelResponse:
     """Build a channel response whose phase and gain vary smoothly over the band.
+
+    >>> import torch
+    >>> from torchsar import echo
+    >>> response = echo.smooth_response(slope_db=20.0)
+    >>> _, amplitude = response.curves(torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64))
+    >>> amplitude.round(decimals=2)
+    tensor([0.3200, 1.0000, 3.1600], dtype=torch.float64)
 
     With the range frequency u = -1..1 over the band, the phase in radians is
     quadratic_rad u^2 + cubic_rad u^3 + ripple_rad sin(pi ripple_cycles u), and the gain in dB is

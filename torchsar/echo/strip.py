@@ -84,6 +84,14 @@ def stripmap_echo(
 ) -> Tensor:
     """Return the raw echo without noise.
 
+    >>> from torchsar import Draws, echo, radar, scene
+    >>> from torchsar.echo.strip import path_geometry
+    >>> strip = radar.StripmapRadar(3e9, radar.LinearFM(40e6, 5e-7), 50e6, 400.0, 120.0, 4000.0)
+    >>> world = scene.StripmapWorld(scene.Points([0.0], [0.0]))
+    >>> placed = path_geometry(world.scene.scatterers(Draws(1)), strip, 4, 64, 0.0, 120.0)
+    >>> (echo.stripmap_echo(placed, world, strip, 4, 64).abs() > 0.5).sum(-1)  # samples of a pulse
+    tensor([26, 26, 26, 26])
+
     The echo is formed in range frequency from the spectrum of the sampled pulse. Slow time is zero
     at the first pulse. Echoes partly outside the record are cut off and never wrap around.
     Differentiable in positions, amplitudes, velocity and Doppler frequency.
@@ -253,6 +261,13 @@ def simulate(
     device: torch.device | str | None = None,
 ) -> tuple[Recording, Truth]:
     """Simulate raw stripmap recordings, one per trial of `draws`.
+
+    >>> from torchsar import Draws, echo, radar, scene
+    >>> strip = radar.StripmapRadar(3e9, radar.LinearFM(40e6, 5e-7), 50e6, 400.0, 120.0, 4000.0)
+    >>> world = scene.StripmapWorld(scene.Points([0.0], [0.0]))
+    >>> recording, truth = echo.simulate(strip, world, n_pulse=16, n_range=64, draws=Draws(1))
+    >>> recording.signal.data.shape, truth.values["crossing_s"]  # of the middle pulse
+    (torch.Size([16, 64]), tensor([0.0200], dtype=torch.float64))
 
     Args:
         radar: Radar parameters.

@@ -22,6 +22,12 @@ from torchsar.scene.trials import either, finite_numbers, with_dims
 class PolynomialSweepError(SweepError):
     """Frequency error of the sweep as a polynomial, sum_i c_i u^i.
 
+    >>> import torch
+    >>> from torchsar import echo
+    >>> error = echo.PolynomialSweepError(up_hz=[1e6], down_hz=[0.0])
+    >>> error.turns(torch.tensor([-1e-6, 0.0, 1e-6]), ramp=0)  # in cycles
+    tensor([-1.,  0.,  1.])
+
     u is the time from the middle of the sweep in seconds. The phase error is the antiderivative of
     the frequency error, zero at the middle of each sweep.
 
@@ -55,6 +61,12 @@ class PolynomialSweepError(SweepError):
 @finite_numbers("a sinusoidal sweep error", frequency_hz="positive")
 class SinusoidSweepError(SweepError):
     """Frequency error of the sweep as a sinusoid, A sin(2 pi F u + phase).
+
+    >>> import math, torch
+    >>> from torchsar import echo
+    >>> error = echo.SinusoidSweepError(amplitude_hz=math.pi * 1e6, frequency_hz=1e6)
+    >>> error.turns(torch.tensor([-5e-7, 0.0, 5e-7]), ramp=0).round(decimals=2)  # in cycles
+    tensor([1., 0., 1.])
 
     u is the time from the middle of the sweep in seconds. The phase error is the antiderivative of
     the frequency error, zero at the middle of each sweep.

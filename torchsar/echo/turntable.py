@@ -32,6 +32,14 @@ def turntable_echo(
 ) -> Tensor:
     """Return range-compressed pulses of a rotating target without range migration and noise.
 
+    >>> import torch
+    >>> from torchsar import echo, radar, scene
+    >>> isar = radar.InverseRadar(1e10, 1e9, 500.0)
+    >>> range_m = torch.tensor([3 * isar.range_step_m], dtype=torch.float64)
+    >>> point = scene.Scatterers(0 * range_m, range_m, torch.ones(1, dtype=torch.complex128))
+    >>> echo.turntable_echo(point, isar, 4, 16, 0.1).abs().argmax(-1)  # sample 8 is the middle
+    tensor([11, 11, 11, 11])
+
     In pulse i and at sample n from the middle of the range window,
 
         s[i, n] = sum_m a_m h(n - y_m / dr)
@@ -93,6 +101,13 @@ def simulate_turntable(
     device: torch.device | str | None = None,
 ) -> tuple[Recording, Truth]:
     """Simulate recordings of a rotating target, one per trial of `draws`.
+
+    >>> from torchsar import Draws, echo, radar, scene
+    >>> isar = radar.InverseRadar(1e10, 1e9, 500.0, rotation_rad_s=0.1)
+    >>> world = scene.TurntableWorld(scene.Points([0.0], [0.0]), motion=[scene.Polynomial([5.0])])
+    >>> recording, truth = echo.simulate_turntable(isar, world, 4, 8, Draws(1))
+    >>> recording.signal.data.abs().argmax(-1), truth.values["displacement_m"]
+    (tensor([4, 4, 4, 4]), tensor([0.0000, 0.0100, 0.0200, 0.0300], dtype=torch.float64))
 
     `world.fidelity` is the model of the echo. With `PhaseOnly`, the recording before impairments is
     EXACTLY the clean recording, noise included, with each pulse multiplied by exp(j psi), where psi

@@ -315,6 +315,14 @@ class PathAutofocus(PathEstimator):
 class CorrectPath(Stage):
     """Recorded positions less their estimated errors, for the stages that image any path.
 
+    >>> import torch
+    >>> from torchsar import compensate, core, radar
+    >>> axes = radar.InverseRadar(1e10, 1e8, 100.0).raw_axes(1, 8)
+    >>> signal = core.Signal(torch.ones(1, 8) + 0j, axes)
+    >>> place_m, offset_m = torch.tensor([[-800.0, 0, 600], [0, 0, 0.5]]).double().split(1)
+    >>> compensate.CorrectPath()(signal, offset_m, place_m)["transmitter_m"]
+    tensor([[-800.0000,    0.0000,  599.5000]], dtype=torch.float64)
+
     The signal stays as it is. A chain connects an autofocus before and an image after it:
 
         correct = use(CorrectPath(), offset_m="autofocus", transmitter_m="aux.transmitter_m")

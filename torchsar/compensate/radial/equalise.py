@@ -85,6 +85,15 @@ def pulse_gain(data: Tensor, *, assess: bool = True) -> Estimate:
 def equalise_pulses(data: Tensor, gain: Tensor) -> Tensor:
     """Divide pulses by their gains.
 
+    >>> import torch
+    >>> from torchsar.compensate import equalise_pulses
+    >>> gain = torch.tensor([0.5, 1.0, 2.0])
+    >>> pulses = gain[:, None] * torch.ones(3, 2, dtype=torch.complex64)
+    >>> equalise_pulses(pulses, gain).abs()
+    tensor([[1., 1.],
+            [1., 1.],
+            [1., 1.]])
+
     Args:
         data: Pulses, shape (..., pulse, range), complex.
         gain: Gains, shape (..., pulse).

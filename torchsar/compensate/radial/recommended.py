@@ -220,6 +220,14 @@ def deramped_lines(bands: Bands, velocity_m_s: Tensor, pulse: Axis) -> Tensor:
 def range_error(estimate: Estimate, radar: TriangularLadar, pulse: Axis, at_s: Tensor) -> Tensor:
     """Compute the range error at any slow time from an estimate of the radial motion.
 
+    >>> import torch
+    >>> from torchsar import Estimate, compensate, radar
+    >>> ladar = radar.TriangularLadar(1.934e14, 5e9, 16e-6, 16e6, 60.0, 3000.0)
+    >>> found = Estimate({"velocity_m_s": torch.full((8,), 0.5, dtype=torch.float64)})
+    >>> pulse, at_s = ladar.sweep_axes(8)[1], torch.tensor([0.0, 16e-6], dtype=torch.float64)
+    >>> compensate.range_error(found, ladar, pulse, at_s).diff()  # metres in one period
+    tensor([8.0000e-06], dtype=torch.float64)
+
     The range error is the integral of the velocities, zero at the first turning point (end of the
     first up sweep), plus lambda / (4 pi) times the phases of the pulses if the estimate has phases.
     Both parts are interpolated by cubic splines.

@@ -255,6 +255,14 @@ def polynomial_phasor(turns: Tensor, step_s: float, n: int, dtype: torch.dtype) 
 class CompensateMotion(Stage):
     """Stage that compensates the radial motion `velocity_m_s`; see `compensate_motion`.
 
+    >>> from torchsar import Draws, compensate, echo, radar, scene
+    >>> ladar = radar.TriangularLadar(1.934e14, 5e9, 16e-6, 16e6, 60.0, 3000.0)
+    >>> world = scene.LadarWorld(scene.Points([0.0], [0.0]), [scene.Polynomial([0.1])])
+    >>> recording, truth = echo.simulate_ladar(ladar, world, 8, Draws(1))
+    >>> still = compensate.CompensateMotion(ladar)(recording.signal, truth.values["velocity_m_s"])
+    >>> [x.data.mean().abs().round(decimals=1) for x in (recording.signal, still)]
+    [tensor(0.), tensor(1.)]
+
     The velocity usually comes from an earlier stage such as `MirrorProduct`.
 
     Args:

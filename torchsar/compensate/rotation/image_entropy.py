@@ -257,6 +257,14 @@ def uniform_rotation(radar: InverseRadar, names: Iterable[str], yc_m: Tensor | f
 class EntropyObjective:
     """Settings of the image entropy as a function of the rotation of a target, see `ImageEntropy`.
 
+    >>> import torch
+    >>> from torchsar.compensate import EntropyObjective, ImageEntropy
+    >>> pulses, range_m = torch.ones(64, 4) + 0j, torch.arange(4, dtype=torch.float64)
+    >>> objective = EntropyObjective(order=3, yc_m=None)
+    >>> figure = ImageEntropy(pulses, objective, wavelength_m=1e-6, prf_hz=1e3, range_m=range_m)
+    >>> figure.start(0.1, torch.zeros(2)).shape  # the unknowns omega, k1, k2 and yc
+    torch.Size([4])
+
     Args:
         order: Degree of the polynomial of time that describes the rotation angle; 1 is uniform
             rotation.
@@ -290,6 +298,14 @@ _DEFAULT = EntropyObjective()
 
 class ImageEntropy:
     """Entropy in nats of the image of range-compressed pulses, as a function of the rotation.
+
+    >>> import torch
+    >>> from torchsar.compensate import EntropyObjective, ImageEntropy
+    >>> pulses = torch.exp(1j * torch.arange(64))[:, None].expand(64, 4)  # tones: uniform rotation
+    >>> settings = {"wavelength_m": 1e-6, "prf_hz": 1e3, "range_m": torch.arange(4).double()}
+    >>> figure = ImageEntropy(pulses, EntropyObjective(order=2, range_term=False), **settings)
+    >>> figure(torch.tensor([[0.0], [10.0]]).double()).round(decimals=1)  # for k1 = 0 and 10 per s
+    tensor([2.9000, 4.1000], dtype=torch.float64)
 
     An instance `figure` is called with candidates x, shape (..., candidate, n). A candidate is a
     vector of the n unknowns that `figure.unknowns` describes. figure(x) returns the entropies,
