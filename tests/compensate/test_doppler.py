@@ -201,9 +201,7 @@ def test_gradient_of_the_objective_is_the_slope_and_both_refinements_agree() -> 
     torch.testing.assert_close(slope, numeric, rtol=1e-4, atol=1e-9)
     signal = recording.signal.with_data(raw)
     by_gradient = stage(signal, doppler_hz=truth)["velocity_m_s"]
-    by_parabola = EffectiveVelocity(OmegaK(radar), lines=128)(signal, doppler_hz=truth)[
-        "velocity_m_s"
-    ]
+    by_parabola = EffectiveVelocity(OmegaK(radar), lines=128)(signal, doppler_hz=truth)["velocity_m_s"]
     torch.testing.assert_close(by_gradient, by_parabola, atol=0.05, rtol=0)
 
 
