@@ -471,7 +471,19 @@ def compensated_omega_k(
 def compensated_image(
     history: Tensor, frequency_hz: Tensor, antennas: AntennaPath, grid: ImageGrid, beam: ProcessedBeam, order: int
 ) -> Tensor:
-    """Form the image of `compensated_omega_k` for a path of one antenna, see there."""
+    """Form the image of `compensated_omega_k` for a path of one antenna.
+
+    Args:
+        history: Phase history, shape (..., pulse, frequency).
+        frequency_hz: Frequencies in Hz, shape (frequency,).
+        antennas: Path of the antenna, which may have trials.
+        grid: Pixels of the image.
+        beam: Processed beam.
+        order: Order of the compensation.
+
+    Returns:
+        The image, shape (..., row, column).
+    """
     history = checked_samples(history, "compensated_omega_k", "pulse, frequency", finite=False)
     history = expanded_history(history, antennas, frequency_hz, "compensated_omega_k")
     if not antennas.trials:

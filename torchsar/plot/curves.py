@@ -89,7 +89,20 @@ def curves_of(
     marks: Mapping[str, float] | None = None,
     ylim: tuple[float, float] | None = None,
 ) -> Figure:
-    """Draw curves into a new figure; the arguments are those of `curves`."""
+    """Draw curves into a new figure.
+
+    Args:
+        width: Width of the figure in inches.
+        series: Horizontal and vertical values of each curve, by its name.
+        xlabel: Label of the horizontal axis.
+        ylabel: Label of the vertical axis.
+        title: Title.
+        marks: Places of vertical lines, by their names.
+        ylim: Limits of the vertical axis.
+
+    Returns:
+        The figure.
+    """
     figure, axes = new_figure(width, 0.68 * width)
     for i, (name, (x, y)) in enumerate(series.items()):
         axes.plot(

@@ -81,7 +81,14 @@ Drawn = TypeVar("Drawn", Figure, list[Figure])
 
 
 def styled(draw: Callable[..., Drawn]) -> Callable[..., Drawn]:
-    """Run a drawing function in the style of this module, without a change of global settings."""
+    """Run a drawing function in the style of this package, without a change of global settings.
+
+    Args:
+        draw: Function that returns a figure or a list of figures.
+
+    Returns:
+        The function in that style; a list becomes `Panels`.
+    """
 
     @functools.wraps(draw)
     def styled(*args: Any, **options: Any) -> Any:
@@ -93,22 +100,53 @@ def styled(draw: Callable[..., Drawn]) -> Callable[..., Drawn]:
 
 
 def new_figure(width: float, height: float, to_scale: bool = False) -> tuple[Figure, Axes]:
-    """Figure of one panel, with its axes."""
+    """Make a figure of one panel.
+
+    Args:
+        width: Width in inches.
+        height: Height in inches.
+        to_scale: The axes have the same scale, and the figure leaves no margins beside them.
+
+    Returns:
+        The figure and its axes.
+    """
     figure = _NotebookFigure(figsize=(width, height), layout="compressed" if to_scale else "constrained")
     return figure, figure.subplots()
 
 
 def panel_width(count: int) -> float:
-    """Width in inches of each of several panels."""
+    """Width of each of several panels.
+
+    Args:
+        count: Number of panels.
+
+    Returns:
+        The width in inches.
+    """
     return ALONE if count == 1 else PANEL
 
 
 def wrapped_title(title: str, width: float) -> str:
+    """Break a title into lines that fit a figure.
+
+    Args:
+        title: Title.
+        width: Width of the figure in inches.
+
+    Returns:
+        The title with line breaks.
+    """
     return textwrap.fill(title, round(_LETTERS * (width - 0.5)))
 
 
 def legend_below(figure: Figure, axes: Axes, least: int = 2) -> None:
-    """Legend below the axes, for which the figure grows, if there are enough entries."""
+    """Draw a legend below the axes, for which the figure grows.
+
+    Args:
+        figure: Figure, which is changed.
+        axes: Axes whose entries the legend shows.
+        least: A legend with fewer entries is not drawn.
+    """
     handles, names = axes.get_legend_handles_labels()
     if len(names) < least:
         return

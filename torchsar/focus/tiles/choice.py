@@ -56,7 +56,15 @@ class Choice:
 
 
 def error_db(scene: Scene, choice: Choice) -> float:
-    """Predicted error of sizes in dB."""
+    """Predict the error of an image with these sizes.
+
+    Args:
+        scene: Geometry.
+        choice: Sizes of tiles and of parts of the aperture.
+
+    Returns:
+        Error relative to the image of white noise in dB.
+    """
     sizes = choice.width, choice.depth, choice.parts, choice.order
     error = scene.sampled(*sizes, dense=choice.parts > _FEW_PARTS).error
     return 20 * math.log10(math.hypot(error, choice.sampling_error))

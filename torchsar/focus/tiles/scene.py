@@ -467,7 +467,16 @@ def _pixel_rule(n: int, size: int) -> tuple[Tensor, Tensor]:
 
 
 def some_of(first: int, last: int, n: int) -> Tensor:
-    """At most n whole numbers of first..last - 1, with both ends."""
+    """Select whole numbers at even distances.
+
+    Args:
+        first: First number.
+        last: The number after the last one.
+        n: Most numbers to select.
+
+    Returns:
+        At most n numbers of first..last - 1, with both ends.
+    """
     return torch.linspace(first, last - 1, min(n, last - first), dtype=torch.float64).round().long()
 
 

@@ -14,18 +14,41 @@ from torchsar.radar import LIGHT_M_S, InverseRadar
 
 
 def ladar(cell_m: float, prf_hz: float) -> InverseRadar:
-    """Return a ladar at 1.55 um with range cells of this size and this pulse rate."""
+    """Describe a ladar at 1.55 um.
+
+    Args:
+        cell_m: Size of a range cell in m.
+        prf_hz: Pulse rate in Hz.
+
+    Returns:
+        The ladar.
+    """
     return InverseRadar(LIGHT_M_S / 1.55e-6, LIGHT_M_S / (2 * cell_m), prf_hz)
 
 
 def known_of(signal: Signal, radar: InverseRadar) -> dict[str, Any]:
-    """Return what estimators of the rotation take besides the data."""
+    """Gather what estimators of the rotation take besides the data.
+
+    Args:
+        signal: Range-compressed pulses.
+        radar: Ladar that recorded them.
+
+    Returns:
+        Arguments by name.
+    """
     return {"wavelength_m": radar.wavelength_m, "prf_hz": radar.prf_hz, "range_m": signal.axis("range").values()}
 
 
 def focused(signal: Signal, radar: InverseRadar, rotation: Mapping[str, Tensor]) -> Signal:
-    """Return the image on a Doppler axis, with what is known of the rotation taken out: all of it,
-    its warp alone, or nothing.
+    """Form the image on a Doppler axis, with what is known of the rotation taken out.
+
+    Args:
+        signal: Range-compressed pulses.
+        radar: Ladar that recorded them.
+        rotation: All parameters of the rotation, its warp alone, or nothing.
+
+    Returns:
+        The image, with the axes doppler and range.
     """
     if "omega_rad_s" in rotation:
         signal = RangePhase(radar)(signal, **{name: rotation[name] for name in ("omega_rad_s", "warp_k", "yc_m")})
@@ -33,7 +56,16 @@ def focused(signal: Signal, radar: InverseRadar, rotation: Mapping[str, Tensor])
 
 
 def in_metres(image: Signal, radar: InverseRadar, rate_rad_s: Tensor) -> Signal:
-    """Return an image whose Doppler is cross range (m) at a mean rate."""
+    """Express the Doppler frequencies of an image as cross range.
+
+    Args:
+        image: Image with the axes doppler and range.
+        radar: Ladar.
+        rate_rad_s: Mean rotation rate in rad/s.
+
+    Returns:
+        The image with an azimuth axis in m.
+    """
     doppler, range_ = image.axes
     scale = radar.wavelength_m / (2 * float(rate_rad_s))
     return Signal(image.data, (Axis("azimuth", doppler.n, doppler.start * scale, doppler.step * scale, "m"), range_))
@@ -42,6 +74,13 @@ def in_metres(image: Signal, radar: InverseRadar, rate_rad_s: Tensor) -> Signal:
 def second_order(signal: Signal, radar: InverseRadar) -> Estimate:
     """Estimate by the second-order method (SM), azimuth only: its one number from short sections,
     then by least entropy. It is not k1 of the target but about k1 + k2 T / 2.
+
+    Args:
+        signal: Range-compressed pulses.
+        radar: Ladar that recorded them.
+
+    Returns:
+        The estimate of the warp.
     """
     figure = ImageEntropy.of(signal, radar, EntropyObjective(order=2, range_term=False))
     return entropy_rotation(
