@@ -102,7 +102,7 @@ def backproject(
     >>> place_m = torch.tensor([[-300.0, 0.5 * y, 100.0] for y in range(-20, 20)]).double()
     >>> given = (9.6e9 + 1e7 * torch.arange(16).double(), place_m, None, 2 * place_m.norm(dim=-1))
     >>> points_m = torch.tensor([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0]]).double()
-    >>> focus.backproject(torch.ones(40, 16) + 0j, *given, points_m).abs().round()
+    >>> focus.backproject(torch.ones(40, 16) + 0j, *given, points_m).abs().round()  # on it, off
     tensor([640.,   1.])
 
         image(x) = sum_p sum_k s[p, k] exp(+2j pi f_k (l_p(x) - l_ref,p) / c),

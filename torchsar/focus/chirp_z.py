@@ -74,7 +74,7 @@ def keystone(data: Tensor, frequency_hz: Tensor, carrier_hz: float, ambiguity: T
     >>> import torch
     >>> from torchsar.focus import keystone
     >>> t, f = (torch.arange(64) - 32.0)[:, None] / 64, torch.tensor([-1e8, 0.0, 1e8])
-    >>> data = torch.exp(2j * torch.pi * 20 * (1 + f / 1e9) * t)
+    >>> data = torch.exp(2j * torch.pi * 20 * (1 + f / 1e9) * t)  # Doppler grows with f
     >>> [torch.fft.fft(x, dim=0).abs().argmax(0).tolist() for x in (data, keystone(data, f, 1e9))]
     [[18, 20, 22], [20, 20, 20]]
 

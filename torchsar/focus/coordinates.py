@@ -27,7 +27,7 @@ def closest_range(
     >>> sensor = radar.StripmapRadar(carrier_hz=3.2e9, pulse=radar.LinearFM(40e6, 0.5e-6),
     ...     sampling_hz=48e6, prf_hz=400.0, velocity_m_s=120.0, near_range_m=4000.0)
     >>> image = torch.nn.functional.one_hot(torch.tensor([48]), 96) + 0j
-    >>> int(focus.closest_range(image, sensor, frame_hz=200.0).abs().argmax())
+    >>> int(focus.closest_range(image, sensor, frame_hz=200.0).abs().argmax())  # 13 m nearer
     44
 
     The squint is that of the line of sight that defines the image coordinates. The interpolation is
@@ -115,7 +115,7 @@ class PaddedLines(Stage):
     >>> from torchsar import Draws, echo, focus, radar, scene
     >>> sensor = radar.StripmapRadar(carrier_hz=3.2e9, pulse=radar.LinearFM(40e6, 0.5e-6),
     ...     sampling_hz=48e6, prf_hz=400.0, velocity_m_s=120.0, near_range_m=4000.0)
-    >>> world = scene.StripmapWorld(scene.Points([18.0], [0.0]), scene.Dwell(0.2))
+    >>> world = scene.StripmapWorld(scene.Points([18.0], [0.0]), scene.Dwell(0.2))  # at the end
     >>> recording, _ = echo.simulate(sensor, world, n_pulse=128, n_range=96, draws=Draws(1))
     >>> stages = focus.OmegaK(sensor), focus.PaddedLines(focus.OmegaK(sensor))
     >>> [round(float(stage(recording.signal).data[:30].abs().max()), 1) for stage in stages]

@@ -29,7 +29,7 @@ def compress_dechirped(
     >>> from torchsar import focus, radar
     >>> ladar = radar.InverseRadar(193.4e12, bandwidth_hz=150e9, prf_hz=2000.0, pulse_s=1e-4)
     >>> beat = torch.exp(-2j * torch.pi * 3 * torch.arange(32) / 32)[None]
-    >>> int(focus.compress_dechirped(beat, ladar).abs().argmax()) - 32 // 2
+    >>> int(focus.compress_dechirped(beat, ladar).abs().argmax()) - 32 // 2  # range in cells
     3
 
     Of n samples, fast-time sample i lies (i - n // 2) pulse_s / n from the middle of the pulse, and
@@ -192,7 +192,7 @@ class AzimuthTransform(Stage):
     >>> ladar = radar.InverseRadar(193.4e12, bandwidth_hz=150e9, prf_hz=2e3, rotation_rad_s=0.005)
     >>> pulses = Signal(torch.ones(64, 32) + 0j, ladar.raw_axes(64, 32))
     >>> image = focus.AzimuthTransform(ladar)(pulses)
-    >>> image.names, float(image.data[32, 0].abs())
+    >>> image.names, float(image.data[32, 0].abs())  # sqrt(64) in the middle
     (('azimuth', 'range'), 8.0)
 
     The azimuth axis is cross range, or Doppler where the radar has no rotation rate.

@@ -168,7 +168,7 @@ class CrossRangeLines:
     >>> lines = focus.CrossRangeLines(step_m=0.5, count=21, omega_rad_s=0.02, wavelength_m=0.03)
     >>> point = torch.exp(-4j * torch.pi / 0.03 * 2.0 * 0.02 * torch.arange(64)[:, None] / 100.0)
     >>> image = focus.matched_fourier(point, torch.zeros(0), 100.0, lines=lines)
-    >>> (int(image.abs().argmax()) - 21 // 2) * 0.5
+    >>> (int(image.abs().argmax()) - 21 // 2) * 0.5  # cross range in metres
     2.0
 
     Line i lies at (i - count // 2) step_m.

@@ -33,7 +33,7 @@ def inverse_requirements(
     >>> ladar = radar.InverseRadar(193.4e12, bandwidth_hz=150e9, prf_hz=2e3, rotation_rad_s=0.005)
     >>> rows = focus.inverse_requirements(ladar, 256, 128, cross_range_extent_m=0.2,
     ...     range_extent_m=0.1, velocity_m_s=0.1)
-    >>> [row.effect for row in rows if not row.ok]
+    >>> [row.effect for row in rows if not row.ok]  # what may not be neglected
     ['envelopes not aligned']
 
     A range shift is also given as its phase at the ends of the range band, pi per range cell. The

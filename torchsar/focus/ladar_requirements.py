@@ -219,7 +219,7 @@ def ladar_requirements(
     >>> ladar = radar.TriangularLadar(carrier_hz=193.4e12, bandwidth_hz=5e9, period_s=16e-6,
     ...     sample_rate_hz=4e6, speed_m_s=60.0, reference_range_m=3000.0)
     >>> rows = focus.ladar_requirements(ladar, 4096, ranges_m=(-0.1, 0.1), speed_m_s=0.1)
-    >>> [row.effect for row in rows if not row.ok]
+    >>> [row.effect for row in rows if not row.ok]  # what may not be neglected
     ['one range per sweep', 'one range per period', 'carrier for f(u) in compensation']
 
     The simplifications are those of the echo model, such as one range per sweep, and those of the

@@ -70,7 +70,7 @@ def range_phase(
     >>> from torchsar.focus import range_phase
     >>> pulses, range_m = torch.ones(3, 2, dtype=torch.complex64), torch.tensor([0.0, 1.0]).double()
     >>> out = range_phase(pulses, range_m, 0.03, prf_hz=1.0, omega_rad_s=0.05, k=torch.zeros(0))
-    >>> out[1:, 1].angle().round(decimals=2)
+    >>> out[1:, 1].angle().round(decimals=2)  # at a range of 1 m
     tensor([-0.5200, -2.0900])
 
     Multiplies range sample n by exp(-2j pi (y_n + yc) (Om phi)^2 / wavelength), where Om phi(t) is
@@ -125,7 +125,7 @@ def matched_fourier(
     >>> import torch
     >>> from torchsar.focus import matched_fourier
     >>> t, k = torch.arange(64) / 100.0, torch.tensor([1.0])
-    >>> point = torch.exp(-2j * torch.pi * 20 * (t + k * t**2 / 2))[:, None]
+    >>> point = torch.exp(-2j * torch.pi * 20 * (t + k * t**2 / 2))[:, None]  # rate grows
     >>> [round(float(matched_fourier(point, k, 100.0).abs().max()), 1) for k in (0 * k, k)]
     [3.3, 7.9]
 

@@ -439,7 +439,7 @@ def compensated_omega_k(
     >>> image = focus.compensated_omega_k(
     ...     torch.ones(160, 16) + 0j, 9.6e9 + 1e7 * torch.arange(16).double(), place_m,
     ...     2 * place_m.norm(dim=-1), grid, focus.ProcessedBeam(3.0))
-    >>> divmod(int(image.abs().argmax()), 17)
+    >>> divmod(int(image.abs().argmax()), 17)  # line and sample of the peak
     (8, 8)
 
     It takes a fraction of the time of tiles, with the error that `MotionCompensation.predicted_db`

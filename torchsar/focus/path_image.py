@@ -38,7 +38,7 @@ class PathImage(Stage):
     """Base class of the stages that image the ground from range profiles along any path.
 
     >>> from torchsar import focus
-    >>> focus.PathImage(azimuth_m=20.0, range_m=10.0, step_m=0.5).grid.counts
+    >>> focus.PathImage(azimuth_m=20.0, range_m=10.0, step_m=0.5).grid.counts  # lines, samples
     (41, 21)
 
     The image has the axes ("azimuth", "range"), in metres on a horizontal plane. A chain connects
@@ -329,7 +329,7 @@ class TileImage(PathImage):
     >>> recording, _ = echo.simulate_path(sensor, world, 40, 16, Draws(1))
     >>> image = focus.TileImage(8.0, 8.0, 0.5)(recording.signal,
     ...     *(recording.aux[x] for x in ("frequency_hz", "transmitter_m", "path_reference_m")))
-    >>> divmod(int(image.data.abs().argmax()), 17)
+    >>> divmod(int(image.data.abs().argmax()), 17)  # line and sample of the peak
     (8, 8)
 
     Args:
@@ -396,7 +396,7 @@ class DirectImage(PathImage):
     >>> recording, _ = echo.simulate_path(sensor, world, 40, 16, Draws(1))
     >>> image = focus.DirectImage(8.0, 8.0, 0.5)(recording.signal,
     ...     *(recording.aux[x] for x in ("frequency_hz", "transmitter_m", "path_reference_m")))
-    >>> divmod(int(image.data.abs().argmax()), 17)
+    >>> divmod(int(image.data.abs().argmax()), 17)  # line and sample of the peak
     (8, 8)
 
     Arguments as in `PathImage`.
@@ -429,7 +429,7 @@ class OmegaKImage(PathImage):
     >>> recording, _ = echo.simulate_path(sensor, world, 160, 16, Draws(1))
     >>> image = focus.OmegaKImage(8.0, 8.0, 0.5, beam_deg=3.0)(recording.signal,
     ...     *(recording.aux[x] for x in ("frequency_hz", "transmitter_m", "path_reference_m")))
-    >>> divmod(int(image.data.abs().argmax()), 17)
+    >>> divmod(int(image.data.abs().argmax()), 17)  # line and sample of the peak
     (8, 8)
 
     See `compensated_omega_k`. Only pulses that see a pixel within the processed beam contribute to

@@ -215,7 +215,7 @@ class PolarFormat(GroundImager):
     >>> signal = Signal(radar.range_profiles(torch.ones(16, 32) + 0j),
     ...     radar.InverseRadar(1.032e10, 6.4e8, 100.0).raw_axes(16, 32))
     >>> image = focus.PolarFormat(extent_m=8.0, step_m=0.5, geometry=geometry)(signal)
-    >>> divmod(int(image.data.abs().argmax()), 17)
+    >>> divmod(int(image.data.abs().argmax()), 17)  # line and sample of the peak
     (8, 8)
 
     The curvature of the wavefront is neglected; `Spotlight.neglected_range_m` gives the error. The

@@ -102,7 +102,7 @@ class RangeCompress(Stage):
     ...     sampling_hz=48e6, prf_hz=400.0, velocity_m_s=120.0, near_range_m=4000.0)
     >>> world = scene.StripmapWorld(scene.Points([0.0], [0.0]), scene.Dwell(0.2))
     >>> recording, _ = echo.simulate(sensor, world, n_pulse=128, n_range=96, draws=Draws(1))
-    >>> int(focus.RangeCompress(sensor)(recording.signal).data[64].abs().argmax())
+    >>> int(focus.RangeCompress(sensor)(recording.signal).data[64].abs().argmax())  # the peak
     36
 
     Samples closer to the end of a line than one pulse length are compressed with the recorded part

@@ -293,7 +293,7 @@ def requirements(
     >>> sensor = radar.StripmapRadar(carrier_hz=3.2e9, pulse=radar.LinearFM(40e6, 0.5e-6),
     ...     sampling_hz=48e6, prf_hz=400.0, velocity_m_s=120.0, near_range_m=4000.0)
     >>> rows = focus.requirements(sensor, sensor.raw_axes(1024, 256))
-    >>> [row.effect for row in rows if not row.ok]
+    >>> [row.effect for row in rows if not row.ok]  # what may not be neglected
     ['bulk + refocus (omega_k)', 'parabolic range history', 'velocity wrong by 1 m/s']
 
     A range shift is also given as its phase at the ends of the range band; a quarter of a range

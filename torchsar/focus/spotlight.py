@@ -89,7 +89,7 @@ def backproject_spotlight(
     ...     1e10 + 2e7 * torch.arange(32).double(), 0.01 * torch.arange(16).double())
     >>> profiles = radar.range_profiles(torch.ones(16, 32) + 0j)
     >>> x_m, y_m = torch.tensor([0.0, 3.0]).double(), torch.zeros(2).double()
-    >>> focus.backproject_spotlight(profiles, geometry, x_m, y_m).abs().round()
+    >>> focus.backproject_spotlight(profiles, geometry, x_m, y_m).abs().round()  # on it, off
     tensor([512.,   3.])
 
         image = sum_k sum_f s_k(f) exp(+4j pi f r_k / c),
@@ -271,7 +271,7 @@ class SpotlightBackprojection(GroundImager):
     >>> signal = Signal(radar.range_profiles(torch.ones(16, 32) + 0j),
     ...     radar.InverseRadar(1.032e10, 6.4e8, 100.0).raw_axes(16, 32))
     >>> image = focus.SpotlightBackprojection(extent_m=8.0, step_m=0.5, geometry=geometry)(signal)
-    >>> divmod(int(image.data.abs().argmax()), 17)
+    >>> divmod(int(image.data.abs().argmax()), 17)  # line and sample of the peak
     (8, 8)
 
     The exact reference for `PolarFormat`; arguments as in `GroundImager`.

@@ -102,7 +102,7 @@ class SpotlightImage(TileImage):
     ...     scene.Flight(scene.StraightPath((-300.0, -10.0, 100.0), (0.0, 20.0, 0.0))))
     >>> recording, _ = echo.simulate_path(sensor, world, 40, 16, Draws(1))
     >>> image = focus.SpotlightImage(recording.aux, 8.0, 8.0, 0.5)(recording.signal)
-    >>> divmod(int(image.data.abs().argmax()), 17)
+    >>> divmod(int(image.data.abs().argmax()), 17)  # line and sample of the peak
     (8, 8)
 
     The geometry is that of the side data of the recording; values that a chain connects replace it,

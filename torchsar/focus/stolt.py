@@ -146,7 +146,8 @@ class OmegaKStolt(Focuser):
     ...     sampling_hz=48e6, prf_hz=400.0, velocity_m_s=120.0, near_range_m=4000.0)
     >>> world = scene.StripmapWorld(scene.Points([0.0], [0.0]), scene.Dwell(0.2))
     >>> recording, _ = echo.simulate(sensor, world, n_pulse=128, n_range=96, draws=Draws(1))
-    >>> divmod(int(focus.OmegaKStolt(sensor)(recording.signal).data.abs().argmax()), 96)
+    >>> image = focus.OmegaKStolt(sensor)(recording.signal)
+    >>> divmod(int(image.data.abs().argmax()), 96)  # line and sample of the peak
     (64, 36)
 
     At a large squint the image can have several lines per pulse, see `omega_k_stolt`.

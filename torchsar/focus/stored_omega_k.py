@@ -146,7 +146,7 @@ class StoredOmegaK(Stage):
     >>> world = scene.StripmapWorld(scene.Points([0.0], [0.0]), scene.Dwell(0.2))
     >>> recording, _ = echo.simulate(sensor, world, n_pulse=128, n_range=96, draws=Draws(1))
     >>> stored = focus.StoredOmegaK(focus.OmegaK(sensor), recording.signal.axes)
-    >>> divmod(int(stored(recording.signal).data.abs().argmax()), 96)
+    >>> divmod(int(stored(recording.signal).data.abs().argmax()), 96)  # line, sample of the peak
     (64, 36)
 
     The stored filters take one complex number per sample of the raw matrix.

@@ -174,7 +174,7 @@ def plan_strip(
 
     >>> from torchsar.focus import plan_strip
     >>> plan = plan_strip((1000, 100), reach=(-20, 20), memory_bytes=3 * 540 * 100 * 8)
-    >>> [(kept.start, kept.stop) for read, kept in plan.blocks]
+    >>> [(kept.start, kept.stop) for read, kept in plan.blocks]  # image lines of each block
     [(0, 500), (500, 1000)]
 
     Three arrays of the size of a block are in memory at once: its raw lines, its image, and the
@@ -334,7 +334,7 @@ class FocusStrip(Stage):
     >>> world = scene.StripmapWorld(scene.Points([0.0], [0.0]), scene.Dwell(0.2))
     >>> recording, _ = echo.simulate(sensor, world, n_pulse=128, n_range=96, draws=Draws(1))
     >>> image = focus.FocusStrip(sensor, band_hz=300.0)(recording.signal)
-    >>> divmod(int(image.data.abs().argmax()), 96)
+    >>> divmod(int(image.data.abs().argmax()), 96)  # line and sample of the peak
     (64, 36)
 
     The image differs from that of one transform by `seam_db` at the seams of the blocks. It needs

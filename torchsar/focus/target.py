@@ -20,7 +20,7 @@ class TargetImage(Stage):
     >>> ladar = radar.InverseRadar(193.4e12, bandwidth_hz=150e9, prf_hz=2e3, rotation_rad_s=0.005)
     >>> pulses = Signal(torch.ones(64, 32) + 0j, ladar.raw_axes(64, 32))
     >>> image = focus.TargetImage(ladar, window="hann")(pulses)
-    >>> image.names, int(image.data[:, 0].abs().argmax())
+    >>> image.names, int(image.data[:, 0].abs().argmax())  # the middle line
     (('azimuth', 'range'), 32)
 
     Where the geometry is known, the image is formed by polar format, otherwise by a Fourier

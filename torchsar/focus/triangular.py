@@ -53,7 +53,7 @@ def compress_sweeps(sweeps: Tensor, radar: TriangularLadar, ramp: Ramp = "up", v
     >>> ladar = radar.TriangularLadar(carrier_hz=193.4e12, bandwidth_hz=5e9, period_s=16e-6,
     ...     sample_rate_hz=4e6, speed_m_s=60.0, reference_range_m=3000.0)
     >>> beat = torch.exp(2j * torch.pi * 3 * torch.arange(32) / 32).expand(2, 8, 32)
-    >>> focus.compress_sweeps(beat, ladar).abs().argmax(-1) - 32 // 2
+    >>> focus.compress_sweeps(beat, ladar).abs().argmax(-1) - 32 // 2  # range in cells
     tensor([3, 3, 3, 3, 3, 3, 3, 3])
 
     A scatterer of amplitude a, RD metres beyond the reference range of the radar in the middle of
@@ -181,7 +181,7 @@ def deramp_azimuth(data: Tensor, radar: TriangularLadar, pulse: Axis, range_: Ax
     ...     sample_rate_hz=4e6, speed_m_s=60.0, reference_range_m=3000.0)
     >>> pulse, range_ = Axis("pulse", 3, -5e-4, 2.5e-4, "s"), Axis("range", 1, 0.0, 0.03, "m")
     >>> out = focus.deramp_azimuth(torch.ones(3, 1) + 0j, ladar, pulse, range_)
-    >>> out[:, 0].real.round(decimals=2)
+    >>> out[:, 0].real.round(decimals=2)  # unchanged at broadside
     tensor([0.3500, 0.9500, 1.0000])
 
     The echo of a scatterer at azimuth x and range R is then a tone of -2 V x / (lambda R) Hz over
@@ -223,7 +223,7 @@ def azimuth_matched_filter(
     ...     sample_rate_hz=4e6, speed_m_s=60.0, reference_range_m=3000.0)
     >>> pulse, range_ = Axis("pulse", 9, -1e-3, 2.5e-4, "s"), Axis("range", 1, 0.0, 0.03, "m")
     >>> image = focus.azimuth_matched_filter(torch.ones(9, 1) + 0j, ladar, pulse, range_)
-    >>> image[:, 0].abs().round(decimals=2)
+    >>> image[:, 0].abs().round(decimals=2)  # focused at azimuth 0
     tensor([0.1200, 0.1300, 0.1400, 0.1500, 1.0000, 0.1500, 0.1400, 0.1300, 0.1200])
 
     The image at azimuth x and range R is the weighted mean over the pulses of the aperture of
