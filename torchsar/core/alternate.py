@@ -19,6 +19,12 @@ from torchsar.core.stage import Stage
 class Turn:
     """One estimator of `Alternate`, with the stage that corrects the data by its estimated values.
 
+    >>> from torchsar import compensate
+    >>> from torchsar.core import Turn
+    >>> turn = Turn(compensate.Sca(), compensate.CorrectPulsePhase())
+    >>> turn.estimator.provides
+    ('phase_rad',)
+
     Args:
         estimator: Stage that returns an Estimate.
         corrector: Stage that removes the estimated effect from the signal before the other
@@ -32,6 +38,15 @@ class Turn:
 class Alternate(Stage):
     """Joint estimate of several effects, by running one estimator for each of them in turn.
 
+    >>> import torch
+    >>> from torchsar import Axis, Signal, compensate
+    >>> from torchsar.core import Alternate, Turn
+    >>> axes = Axis("pulse", 3, 0.0, 0.1, "s"), Axis("range", 2, 0.0, 1.0, "m")
+    >>> envelope = Turn(compensate.AlignEnvelopes(assess=False), compensate.ShiftRange())
+    >>> both = Alternate(rounds=2, envelope=envelope, phase=Turn(compensate.Sca(assess=False)))
+    >>> both(Signal(torch.tensor([[1, 0], [1j, 0], [-1, 0]]), axes))["phase_rad"]
+    tensor([0.0000, 1.5708, 3.1416])
+
     Each turn has an estimator of one effect. It may also have a corrector, a stage that removes
     this effect from the signal. One round runs the estimators of all turns in the order given.
 
@@ -44,8 +59,6 @@ class Alternate(Stage):
     is often doubtful before the other effects are corrected. The outcome of the result is the worst
     of the last outcomes of the estimators and of those of the values that they last used: an
     estimate from data corrected by a wrong value may look right.
-
-        Alternate(rounds=3, phase=Turn(autofocus, corrector), rotation=Turn(estimator))
 
     Args:
         rounds: Number of rounds, at least one.

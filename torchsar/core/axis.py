@@ -15,6 +15,13 @@ _DUAL_NAME = {"pulse": "doppler", "range": "range_frequency"}
 class Axis:
     """Uniform sampling grid of one dimension: sample i lies at `start + i * step`.
 
+    >>> from torchsar import Axis
+    >>> pulses = Axis("pulse", 8, start=0.0, step=0.25, unit="s")
+    >>> pulses.stop, float(pulses.index_of(0.5))
+    (1.75, 2.0)
+    >>> pulses.dual()
+    Axis(name='doppler', n=8, start=-2.0, step=0.5, unit='Hz', dual_start=0.0)
+
     Raw data have the axes `pulse` (slow time in s) and `range` (slant range in m), images the axes
     `azimuth` and `range` (both in m). A frequency axis made by `dual` keeps the `start` of the axis
     from which it was made, so that the inverse transform restores that axis.

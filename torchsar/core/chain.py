@@ -21,6 +21,10 @@ Given = Mapping[str, Tensor | Estimate]
 class Use(nn.Module):
     """Stage together with the sources of its keyword values; made by the function `use`.
 
+    >>> from torchsar import compensate, use
+    >>> use(compensate.CorrectPulsePhase(), phase_rad="phase").names
+    {'phase_rad': 'phase.phase_rad'}
+
     Args:
         stage: Stage whose `forward` takes the values.
         names: Source of each parameter of `forward`: "STAGE.VALUE" for the value VALUE that the
@@ -39,9 +43,12 @@ class Use(nn.Module):
 def use(stage: nn.Module, *, in_doubt: str = "apply", **names: str) -> Use:
     """Connect parameters of a stage to values of earlier stages or to recorded side data.
 
-    In the following example the values come from the stages named "doppler" and "velocity".
-
-        use(OmegaK(radar), doppler_hz="doppler", velocity_m_s="velocity")
+    >>> from torchsar import Chain, compensate, use
+    >>> correct = use(compensate.CorrectPulsePhase(), phase_rad="phase")
+    >>> Chain(phase=compensate.Sca(), correct=correct)
+    Chain(2 stages
+      phase: Sca, estimates phase_rad
+      correct: CorrectPulsePhase, uses phase_rad from phase.phase_rad)
 
     Where an estimate failed (`Estimate.failed`), the stage gets the neutral value of the estimator
     in place of the estimated one, for example no phase error or the nominal velocity. A stage that
@@ -84,6 +91,14 @@ def use(stage: nn.Module, *, in_doubt: str = "apply", **names: str) -> Use:
 @dataclass(frozen=True, repr=False)
 class Trace(Shown):
     """All intermediate results of one run of a chain, by the names of the stages.
+
+    >>> import torch
+    >>> from torchsar import Axis, Chain, Signal, compensate
+    >>> axes = Axis("pulse", 3, 0.0, 0.1, "s"), Axis("range", 2, 0.0, 1.0, "m")
+    >>> chain = Chain(phase=compensate.Sca(assess=False))
+    >>> trace = chain.trace(Signal(torch.tensor([[1, 0], [1j, 0], [-1, 0]]), axes))
+    >>> trace.values["phase.phase_rad"]
+    tensor([0.0000, 1.5708, 3.1416])
 
     Args:
         inputs: Signal before each stage.
@@ -199,6 +214,14 @@ class _Log:
 
 class Chain(Shown, nn.Module):
     """Sequence of stages that run in order and pass estimates to later stages as named values.
+
+    >>> import torch
+    >>> from torchsar import Axis, Chain, Signal, compensate, use
+    >>> axes = Axis("pulse", 3, 0.0, 0.1, "s"), Axis("range", 2, 0.0, 1.0, "m")
+    >>> correct = use(compensate.CorrectPulsePhase(), phase_rad="phase")
+    >>> chain = Chain(phase=compensate.Sca(assess=False), correct=correct)
+    >>> chain(Signal(torch.tensor([[1, 0], [1j, 0], [-1, 0]]), axes)).data[:, 0].real.round()
+    tensor([1., 1., 1.])
 
     `chain(x)` returns the signal after the last stage, and `chain.trace(x)` a Trace of all
     intermediate results. `chain.rerun(trace, start, given={"velocity.velocity_m_s": v})` repeats

@@ -19,6 +19,13 @@ def refuse_non_finite(
 ) -> None:
     """Raise ValueError if samples are NaN or infinite.
 
+    >>> import torch
+    >>> from torchsar.core import refuse_non_finite
+    >>> refuse_non_finite(torch.tensor([1.0, torch.inf]), "gain", "repeat the calibration")
+    Traceback (most recent call last):
+        ...
+    ValueError: gain: 1 of 2 samples are NaN or Inf, the first at index (1,); repeat the calibration
+
     For valid data the check takes the time of one sum over the samples. It has no effect inside
     torch.vmap, where values cannot be read.
 
@@ -71,6 +78,12 @@ def checked_samples(
 ) -> Tensor:
     """Check the samples that a function works on, and resolve lazy conjugation and negation.
 
+    >>> import torch
+    >>> from torchsar.core import checked_samples
+    >>> raw = torch.ones(4, 8, dtype=torch.complex64).conj()
+    >>> raw.is_conj(), checked_samples(raw, "range compression", "pulse, range").is_conj()
+    (True, False)
+
     Args:
         x: Samples, shape (..., *dims), complex64 or complex128.
         what: Name of the function for the message.
@@ -115,6 +128,11 @@ def checked_samples(
 def power_of(x: Tensor) -> Tensor:
     """Compute |x|^2 from real and imaginary part, without a root. Differentiable.
 
+    >>> import torch
+    >>> from torchsar.core import power_of
+    >>> power_of(torch.tensor([3 + 4j, 1j]))
+    tensor([25.,  1.])
+
     Args:
         x: Samples, any shape, real or complex.
 
@@ -126,6 +144,11 @@ def power_of(x: Tensor) -> Tensor:
 
 def level_of(x: Tensor, trailing: int = 2) -> Tensor:
     """Return a power of two next to the largest magnitude of each trial.
+
+    >>> import torch
+    >>> from torchsar.core import level_of
+    >>> level_of(torch.tensor([3.0, -5.0]), trailing=1)
+    tensor([4.])
 
     Samples divided by it have squares and fourth powers that neither underflow nor overflow in
     single precision. The division is exact, so that results do not depend on the scale of the
@@ -151,6 +174,11 @@ def level_of(x: Tensor, trailing: int = 2) -> Tensor:
 
 def unit_level(x: Tensor, trailing: int = 2) -> Tensor:
     """Divide each trial by its level, see `level_of`.
+
+    >>> import torch
+    >>> from torchsar.core import unit_level
+    >>> unit_level(torch.tensor([3.0, -5.0]), trailing=1)
+    tensor([ 0.7500, -1.2500])
 
     Args:
         x: Samples, shape (..., and `trailing` dimensions), real or complex.

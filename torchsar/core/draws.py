@@ -41,15 +41,17 @@ def _key(*address: str | int) -> int:
 class Draws:
     """Source of random numbers, each of which depends only on its address.
 
-    The address of a draw is (seed, purpose, case, trial), where the purpose is the name of the
-    quantity that is drawn. A draw therefore does not depend on draws made before it, or on the
-    division of trials into chunks; a repeated draw gives the same numbers.
-
+    >>> import torch
+    >>> from torchsar import Draws
     >>> draws = Draws(seed=1, trials=range(3))
     >>> draws.normal("noise", (4, 5), torch.complex64).shape
     torch.Size([3, 4, 5])
     >>> bool((draws.for_trials([2]).uniform("phase") == draws.uniform("phase")[2]).all())
     True
+
+    The address of a draw is (seed, purpose, case, trial), where the purpose is the name of the
+    quantity that is drawn. A draw therefore does not depend on draws made before it, or on the
+    division of trials into chunks; a repeated draw gives the same numbers.
 
     Args:
         seed: Seed of the whole study.

@@ -17,6 +17,11 @@ from torchsar.core.signal import Signal
 def centred_fft(x: Tensor, dim: int = -1) -> Tensor:
     """Compute the Fourier transform whose phases refer to the middle sample.
 
+    >>> import torch
+    >>> from torchsar.core import centred_fft
+    >>> centred_fft(torch.ones(4)).real  # frequency zero is sample n // 2
+    tensor([0., 0., 4., 0.])
+
     X(f) = sum_i x[i] exp(-2j pi f (i - n // 2)), differentiable; the inverse is `centred_ifft`.
 
     Args:
@@ -36,6 +41,11 @@ def centred_fft(x: Tensor, dim: int = -1) -> Tensor:
 
 def centred_ifft(x: Tensor, dim: int = -1) -> Tensor:
     """Compute the inverse Fourier transform of a spectrum whose phases refer to the middle sample.
+
+    >>> import torch
+    >>> from torchsar.core import centred_ifft
+    >>> centred_ifft(torch.tensor([0.0, 0.0, 4.0, 0.0])).real
+    tensor([1., 1., 1., 1.])
 
     x[i] = (1 / n) sum_f X(f) exp(2j pi f (i - n // 2)), the inverse of `centred_fft`.
 
@@ -102,6 +112,14 @@ class _ContiguousGradient(torch.autograd.Function):
 def to_frequency(signal: Signal, name: str) -> Signal:
     """Transform one axis of a signal to frequency.
 
+    >>> import torch
+    >>> from torchsar import Axis, Signal
+    >>> from torchsar.core import to_frequency
+    >>> line = Signal(torch.ones(4, dtype=torch.complex64), (Axis("range", 4, 0.0, 0.5, "m"),))
+    >>> spectrum = to_frequency(line, "range")
+    >>> spectrum.names, spectrum.axes[0].step, spectrum.data.abs().tolist()
+    (('range_frequency',), 0.5, [0.0, 0.0, 4.0, 0.0])
+
     Phases refer to the middle sample (n // 2) of the axis, not to its coordinate zero.
 
     Args:
@@ -120,6 +138,13 @@ def to_frequency(signal: Signal, name: str) -> Signal:
 
 def from_frequency(signal: Signal, name: str) -> Signal:
     """Transform a frequency axis back to the original axis; the inverse of `to_frequency`.
+
+    >>> import torch
+    >>> from torchsar import Axis, Signal
+    >>> from torchsar.core import from_frequency, to_frequency
+    >>> line = Signal(torch.ones(4, dtype=torch.complex64), (Axis("range", 4, 0.0, 0.5, "m"),))
+    >>> from_frequency(to_frequency(line, "range"), "range_frequency").axes == line.axes
+    True
 
     Args:
         signal: Signal with a frequency axis made by `to_frequency`.

@@ -32,6 +32,13 @@ _gathered = _Gathered()
 def host_value(x: Tensor, otherwise: Number) -> Number:
     """Read a number from a tensor, which waits for its device.
 
+    >>> import torch
+    >>> from torchsar.core import host_value
+    >>> host_value(torch.tensor([3]), otherwise=0)
+    3
+    >>> torch.func.vmap(lambda x: x + host_value(x, otherwise=10.0))(torch.tensor([3.0, 4.0]))
+    tensor([13., 14.])
+
     Checks that wait for values of this device (see `gathered_checks`) are made in the same wait.
     Inside `torch.func.vmap` a tensor stands for many trials, and while a program is traced, as by
     `torch.export`, for any data: its value cannot be read.
@@ -86,6 +93,10 @@ def host_largest(x: Tensor, otherwise: Number) -> Number:
 
 def device_fault(device: torch.device | str) -> str:
     """Find out whether a device can compute; on some devices allocation alone succeeds.
+
+    >>> from torchsar.core import device_fault
+    >>> device_fault("cpu") == "", device_fault("xla") == ""  # a device of another package
+    (True, False)
 
     Args:
         device: The device, such as "cpu" or "cuda:1".
@@ -150,6 +161,16 @@ def untraced(*given: Tensor | float | None) -> Iterator[None]:
 def check_value(x: Tensor, check: Check) -> None:
     """Check the numbers in a small tensor: at once, or in `gathered_checks` perhaps later.
 
+    >>> import torch
+    >>> from torchsar.core import check_value
+    >>> def refuse(largest):
+    ...     if largest > 1:
+    ...         raise ValueError(f"the largest value must be at most 1, got {largest:g}")
+    >>> check_value(torch.tensor([0.5, 2.0]).max(), refuse)
+    Traceback (most recent call last):
+        ...
+    ValueError: the largest value must be at most 1, got 2
+
     Where values cannot be read, see `host_value`, nothing is checked.
 
     Args:
@@ -171,6 +192,15 @@ def check_value(x: Tensor, check: Check) -> None:
 @contextmanager
 def gathered_checks() -> Iterator[None]:
     """Within the block, let the checks of `check_value` wait until a value is read from the device.
+
+    >>> import torch
+    >>> from torchsar.core import gathered_checks, refuse_non_finite
+    >>> with gathered_checks():
+    ...     refuse_non_finite(torch.tensor([1.0, 2.0]), "phase")
+    ...     refuse_non_finite(torch.tensor([1.0, torch.inf]), "gain", "repeat the calibration")
+    Traceback (most recent call last):
+        ...
+    ValueError: gain: 1 of 2 samples are NaN or Inf, the first at index (1,); repeat the calibration
 
     On an accelerator every value that the host reads makes it wait for the device. Waiting checks
     are made, in their order, with the next number that `host_value` reads, and at the end of the

@@ -20,6 +20,11 @@ _REAL = {torch.complex64: torch.float32, torch.complex128: torch.float64}
 def real_dtype(dtype: torch.dtype) -> torch.dtype:
     """Return the real dtype that belongs to a complex one.
 
+    >>> import torch
+    >>> from torchsar.core import real_dtype
+    >>> real_dtype(torch.complex64)
+    torch.float32
+
     Args:
         dtype: complex64 or complex128.
 
@@ -36,6 +41,11 @@ def real_dtype(dtype: torch.dtype) -> torch.dtype:
 
 def cis(angle_rad: Tensor) -> Tensor:
     """Compute exp(1j * angle) in the precision of the angle.
+
+    >>> import torch
+    >>> from torchsar.core import cis
+    >>> cis(torch.tensor([0.0, torch.pi / 2])).imag
+    tensor([0., 1.])
 
     It takes a third of the time of torch.polar. Use `unit_phasor` for phases of more than a few
     turns. Differentiable.
@@ -63,6 +73,11 @@ def cis(angle_rad: Tensor) -> Tensor:
 def reduced_turns(turns: Tensor) -> Tensor:
     """Remove whole turns from a phase.
 
+    >>> import torch
+    >>> from torchsar.core import reduced_turns
+    >>> reduced_turns(torch.tensor([1000000.25, -2.75], dtype=torch.float64))
+    tensor([0.2500, 0.2500], dtype=torch.float64)
+
     Differentiable: the number of removed turns counts as a constant.
 
     Args:
@@ -87,6 +102,11 @@ def reduced_turns(turns: Tensor) -> Tensor:
 def wrapped(x: Tensor, period: float) -> Tensor:
     """Wrap values into the interval -period / 2..period / 2.
 
+    >>> import torch
+    >>> from torchsar.core import wrapped
+    >>> wrapped(torch.tensor([10.0, 190.0, -350.0]), 360.0)
+    tensor([  10., -170.,   10.])
+
     Args:
         x: Values, any shape.
         period: Length of the interval, in the unit of the values.
@@ -99,6 +119,11 @@ def wrapped(x: Tensor, period: float) -> Tensor:
 
 def unit_phasor(turns: Tensor, dtype: torch.dtype) -> Tensor:
     """Compute exp(2j * pi * turns); whole turns are removed while the phase is still float64.
+
+    >>> import torch
+    >>> from torchsar.core import unit_phasor
+    >>> unit_phasor(torch.tensor([1000000.0, 1000000.5], dtype=torch.float64), torch.complex64).real
+    tensor([ 1., -1.])
 
     The phase of an echo in this package is -2 pi f tau, so that an echo of delay tau at the carrier
     frequency f is `unit_phasor(-f * tau, dtype)`. Differentiable.
@@ -133,6 +158,12 @@ def _check_resolution(turns: Tensor) -> None:
 
 def linear_phasor(turns_per_step: Tensor, start: float, n: int, dtype: torch.dtype) -> Tensor:
     """Compute the phasors exp(2j pi s (start + i)) for i = 0..n - 1 of a linear phase.
+
+    >>> import torch
+    >>> from torchsar.core import linear_phasor
+    >>> quarter = torch.tensor(0.25, dtype=torch.float64)
+    >>> torch.view_as_real(linear_phasor(quarter, 0, 4, torch.complex64)).round().int().tolist()
+    [[1, 0], [0, 1], [-1, 0], [0, -1]]
 
     They are products of the elements of two short tables, which is as exact as `unit_phasor` of
     every element and takes a tenth of the time. Differentiable.

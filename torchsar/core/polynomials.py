@@ -9,6 +9,11 @@ from torch import Tensor
 def legendre(u: Tensor, order: int) -> Tensor:
     """Evaluate the Legendre polynomials of degree 0 to `order`.
 
+    >>> import torch
+    >>> from torchsar.core import legendre
+    >>> legendre(torch.tensor([0.0, 1.0]), order=2).tolist()
+    [[1.0, 0.0, -0.5], [1.0, 1.0, 1.0]]
+
     The mean square of the polynomial of degree d over -1..1 is 1 / (2 d + 1). Differentiable.
 
     Args:

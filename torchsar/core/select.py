@@ -24,6 +24,12 @@ def numbers_on(device: torch.device | str | None, *numbers: float) -> Tensor:
 def per_trial(value: Tensor | float, trailing: int, like: Tensor) -> Tensor:
     """Append dimensions of length one to values per trial, so that they broadcast against data.
 
+    >>> import torch
+    >>> from torchsar.core import per_trial
+    >>> data = torch.ones(2, 4, 8)  # trials, pulses, range cells
+    >>> (data * per_trial(torch.tensor([1.0, 3.0]), 2, data))[:, 0, 0]
+    tensor([1., 3.], dtype=torch.float64)
+
     Args:
         value: Number, or one value per trial, shape (...,).
         trailing: Number of dimensions of the data after the trial dimensions.
@@ -56,6 +62,11 @@ def true_positions(mask: Tensor, count: int) -> Tensor:
 
 def take(x: Tensor, index: Tensor, dim: int = -1) -> Tensor:
     """Take the element at one index per trial along a dimension.
+
+    >>> import torch
+    >>> from torchsar.core import take
+    >>> take(torch.tensor([[1.0, 2.0], [3.0, 4.0]]), torch.tensor([0, 1]))  # one index per trial
+    tensor([1., 4.])
 
     Args:
         x: Tensor with the dimension `dim`, any shape.

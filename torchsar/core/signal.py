@@ -27,6 +27,13 @@ _ADVICE = "the numbers are too large for this type: scale the samples, or choose
 class Signal(Shown):
     """Samples with named trailing axes; every dimension before them is a Monte Carlo trial.
 
+    >>> import torch
+    >>> from torchsar import Axis, Signal
+    >>> axes = Axis("pulse", 4, 0.0, 0.01, "s"), Axis("range", 8, 9000.0, 3.0, "m")
+    >>> signal = Signal(torch.ones(4, 8, dtype=torch.complex64), axes)
+    >>> signal.sel(range=slice(9003, 9010))
+    Signal(complex64 (4, 3), cpu, 96 bytes; pulse: 4, 0 to 0.03 s; range: 3, 9003 to 9009 m)
+
     Slow time comes before fast time, and range is last and contiguous. Samples are complex, except
     those of a one-channel detector, which are real.
 
@@ -204,6 +211,14 @@ class Signal(Shown):
 class Recording(Shown):
     """Samples of an instrument, with its description and the side data recorded beside them.
 
+    >>> import torch
+    >>> from torchsar import Recording, radar
+    >>> turntable = radar.InverseRadar(carrier_hz=10e9, bandwidth_hz=500e6, prf_hz=100.0)
+    >>> Recording.from_arrays(torch.ones(4, 8, dtype=torch.complex64), turntable)
+    Recording(InverseRadar; complex64 (4, 8), cpu, 256 bytes
+      pulse: 4, 0 to 0.03 s
+      range: 8, -1.19917 to 0.899377 m)
+
     Args:
         signal: Raw samples with their axes.
         radar: Description of the instrument (carrier, waveform, nominal path), such as a
@@ -363,6 +378,13 @@ def _check_side_data(side: Tensor, samples: Tensor, what: str) -> None:
 @dataclass(frozen=True, repr=False)
 class Truth(Shown):
     """True values of a simulation, for evaluation only; no processing stage may use them.
+
+    >>> from torchsar import Draws, echo, radar, scene
+    >>> flight = scene.Flight(scene.StraightPath([-5e3, 0.0, 3e3], [0.0, 100.0, 0.0]))
+    >>> world = scene.PathWorld(scene.Points(azimuth_m=[0.0, 5.0], range_m=[0.0, 2.0]), flight)
+    >>> _, truth = echo.simulate_path(radar.InverseRadar(10e9, 100e6, 100.0), world, 4, 8, Draws(1))
+    >>> truth.values["range_m"]
+    tensor([0., 2.], dtype=torch.float64)
 
     Args:
         values: True values by name; tensors begin with the trial dimensions.

@@ -22,6 +22,16 @@ from torchsar.core.signal import Signal
 class Stage(nn.Module):
     """Base class of a processing stage, which checks axes and samples before `forward` runs.
 
+    >>> import torch
+    >>> from torchsar import Axis, Signal, Stage
+    >>> class Attenuate(Stage):
+    ...     works_on = ("range",)
+    ...     def forward(self, signal, gain_db=-20.0):
+    ...         return signal.with_data(signal.data * 10 ** (gain_db / 20))
+    >>> line = Signal(torch.ones(2, dtype=torch.complex64), (Axis("range", 2, 0.0, 1.0, "m"),))
+    >>> Attenuate()(line).data.abs()
+    tensor([0.1000, 0.1000])
+
     `stage(signal, **values)` returns a Signal, an Estimate (the signal is then unchanged), or a
     pair of both. A Chain can connect keyword parameters of `forward` to values that earlier stages
     estimate. A subclass holds its constants as buffers and its tunable values as nn.Parameters (see

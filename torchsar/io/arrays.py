@@ -49,6 +49,14 @@ def write_arrays(
 def read_images(path: str | Path) -> dict[str, Signal]:
     """Read the images in the store of a run.
 
+    >>> import tempfile, torch
+    >>> from torchsar import Axis, Signal, io
+    >>> from torchsar.io.arrays import write_arrays
+    >>> axes = Axis("azimuth", 8, 0.0, 2.0, "m"), Axis("range", 4, 9000.0, 3.0, "m")
+    >>> write_arrays(path := tempfile.mkdtemp(), {"rda": Signal(torch.ones(8, 4), axes)}, {}, {})
+    >>> {method: image.names for method, image in io.read_images(path).items()}
+    {'rda': ('azimuth', 'range')}
+
     Args:
         path: Folder of the store, arrays.zarr in the folder of a run.
 

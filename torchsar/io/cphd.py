@@ -30,6 +30,11 @@ _Bands = tuple[Tensor, Tensor, Callable[[Tensor, slice], Tensor]]
 def read_cphd(path: str | Path, dtype: torch.dtype = torch.complex64, channel: str | None = None) -> Recording:
     """Read a channel of a file of compensated phase history data (CPHD, versions 1.0.1 and 1.1.0).
 
+    >>> from torchsar import io
+    >>> recording = io.read_cphd("flight.cphd")  # doctest: +SKIP
+    >>> recording.signal.names, recording.aux["transmitter_m"].shape  # doctest: +SKIP
+    (('pulse', 'range'), torch.Size([8, 3]))
+
     In the domain FX a sample at the frequency f has the phase SGN 2 pi f dt of a target whose echo
     arrives dt after that of the reference point (SRP) of its vector; in the domain TOA the peak of
     a target has the phase SGN 2 pi f_c dt, f_c the middle of FX1 and FX2. Both signs are accepted.

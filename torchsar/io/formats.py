@@ -94,6 +94,14 @@ def format_of(path: str | Path) -> Format:
 def read(path: str | Path, dtype: torch.dtype = torch.complex64) -> Recording | Signal:
     """Read a data file of any format, which its first bytes or its ending tell.
 
+    >>> import numpy, pathlib, tempfile
+    >>> from torchsar import io
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "turntable.npz"
+    >>> sig, freq_hz = numpy.ones((3, 2), complex), [1e9, 2e9, 3e9]
+    >>> numpy.savez(path, sig=sig, freq_hz=freq_hz, angle_deg=[0, 1])
+    >>> io.read(path).signal.names
+    ('pulse', 'range')
+
     Numpy archives (.npz) are read by `read_stripmap`, `read_path` or `read_inverse`, as their keys
     say; phase histories (CPHD) by `read_cphd`; complex images (SICD) by `read_sicd`.
 
@@ -118,6 +126,14 @@ def read(path: str | Path, dtype: torch.dtype = torch.complex64) -> Recording | 
 
 def read_history(path: str | Path, dtype: torch.dtype = torch.complex64) -> Recording:
     """Read a phase history with the positions of its antennas from a file of any format.
+
+    >>> import numpy, pathlib, tempfile
+    >>> from torchsar import io
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "flight.npz"
+    >>> places = dict(transmitter_m=[[0, -5e3, 3e3], [1, -5e3, 3e3]], path_reference_m=[11e3, 11e3])
+    >>> numpy.savez(path, history=numpy.ones((3, 2), complex), freq_hz=[1e9, 2e9, 3e9], **places)
+    >>> io.read_history(path).aux["transmitter_m"].shape
+    torch.Size([2, 3])
 
     Args:
         path: Path of the file.

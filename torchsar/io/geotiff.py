@@ -33,6 +33,13 @@ def write_geotiff(
     """Write the amplitude of an image as a GeoTIFF in the projection UTM (polar stereographic near
     the poles).
 
+    >>> import torch
+    >>> from torchsar import Signal, focus, io, radar
+    >>> stage = focus.DirectImage(azimuth_m=8.0, range_m=6.0, step_m=1.0)
+    >>> image = Signal(torch.ones(9, 7, dtype=torch.complex64), stage.axes)
+    >>> io.write_geotiff(image, "a.tif", stage, radar.LocalFrame(48, 11)) < 0.01  # doctest: +SKIP
+    True
+
     Samples are not resampled. Columns are along the axis of the image that is closest to east, and
     rows along that closest to south; the file has the affine map of the pixels to the projection,
     with its rotation. If this map is wrong by more than a tenth of a pixel, as for images of more
@@ -88,6 +95,12 @@ def write_geotiff(
 
 def write_strip_geotiff(image: StripImage, path: str | Path) -> None:
     """Write the amplitude of a strip as a tiled GeoTIFF with overviews, reading it in parts.
+
+    >>> import tempfile, torch
+    >>> from torchsar import Axis, io
+    >>> axes = Axis("azimuth", 8, 0.0, 2.0, "m"), Axis("range", 4, 9000.0, 3.0, "m")
+    >>> image = io.StripImage.create(tempfile.mkdtemp(), axes, torch.complex64, {}, {})
+    >>> io.write_strip_geotiff(image, "image.tif")  # doctest: +SKIP
 
     The file has columns along slant range and rows along azimuth, its coordinates are slant range
     and azimuth in metres, and it names no map projection: a straight stripmap path has no position

@@ -22,6 +22,7 @@ def read_inverse(path: str | Path, dtype: torch.dtype = torch.complex64) -> Reco
     """Read range profiles, a turntable sweep or a spotlight phase history from a numpy archive.
 
     >>> import numpy, pathlib, tempfile
+    >>> from torchsar.io import read_inverse
     >>> path = pathlib.Path(tempfile.mkdtemp()) / "turntable.npz"
     >>> sig, freq_hz = numpy.ones((3, 2), complex), [1e9, 2e9, 3e9]
     >>> numpy.savez(path, sig=sig, freq_hz=freq_hz, angle_deg=[0, 1])

@@ -13,6 +13,14 @@ from torchsar.io.extras import library, write_whole
 def write_netcdf(signal: Signal, path: str | Path, title: str = "") -> None:
     """Write an image with its axes as a netCDF-4 file, which xarray and other programs open.
 
+    >>> import h5py, tempfile, torch
+    >>> from torchsar import Axis, Signal, io
+    >>> axes = Axis("azimuth", 8, 0.0, 2.0, "m"), Axis("range", 4, 9000.0, 3.0, "m")
+    >>> path = f"{tempfile.mkdtemp()}/image.nc"
+    >>> io.write_netcdf(Signal(torch.ones(8, 4), axes), path)
+    >>> sorted(h5py.File(path))
+    ['azimuth', 'image', 'range']
+
     The format has no complex numbers: the variables `image_real` and `image_imag` are the parts of
     a complex image, and `image` is a real one. The coordinates of each axis are a variable with the
     name of the axis and the attribute `units`. The file has neither groups nor trials.

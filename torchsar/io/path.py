@@ -23,6 +23,7 @@ def read_path(path: str | Path, dtype: torch.dtype = torch.complex64) -> Recordi
     """Read the phase history of an antenna or a pair of antennas on any path.
 
     >>> import numpy, pathlib, tempfile
+    >>> from torchsar.io import read_path
     >>> path = pathlib.Path(tempfile.mkdtemp()) / "flight.npz"
     >>> places = dict(transmitter_m=[[0, -5e3, 3e3], [1, -5e3, 3e3]], path_reference_m=[11e3, 11e3])
     >>> numpy.savez(path, history=numpy.ones((3, 2), complex), freq_hz=[1e9, 2e9, 3e9], **places)

@@ -37,6 +37,7 @@ def read_stripmap(path: str | Path, dtype: torch.dtype = torch.complex64) -> Rec
     """Read a raw stripmap recording from a numpy archive.
 
     >>> import numpy, pathlib, tempfile
+    >>> from torchsar.io import read_stripmap
     >>> path = pathlib.Path(tempfile.mkdtemp()) / "strip.npz"
     >>> numbers = dict(fs_hz=50e6, prf_hz=400.0, f0_hz=5.3e9, chirp_rate_hz_s=1e14, pulse_s=1e-7)
     >>> place = dict(slant_range_cell1_m=9000.0, v_eff_m_s=7000.0)

@@ -15,6 +15,10 @@ from torchsar.io.extras import library, reading
 def read_sicd(path: str | Path, dtype: torch.dtype = torch.complex64) -> Signal:
     """Read a complex image from a file in the format SICD (NITF).
 
+    >>> from torchsar import io
+    >>> io.read_sicd("image.nitf").names  # doctest: +SKIP
+    ('azimuth', 'range')
+
     Rows, which the standard orders by range, become the axis of range, and columns that of
     azimuth. Samples are those of the file: the spectrum of the image lies about zero, and the
     spatial frequencies KCtr of the file are not restored.

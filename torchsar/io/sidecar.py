@@ -105,6 +105,18 @@ _ENTRY = ("name", "file", "unit", "transpose", "first", "step", *_FLAT)
 def import_recording(path: str | Path, sidecar: Mapping[str, Any], out: str | Path, name: str = "sidecar") -> Path:
     """Write recorded data of another format as an archive for the readers of this package.
 
+    >>> import numpy, pathlib, tempfile
+    >>> from torchsar import io
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "raw.npz"
+    >>> numpy.savez(path, echo=numpy.ones((4, 8), "complex64"))
+    >>> sidecar = {
+    ...     "system": "isal",
+    ...     "samples": {"key": "profiles", "name": "echo", "dims": ["pulse", "range"]},
+    ...     "radar": {"range_step_m": 0.3, "bandwidth_hz": 5e8, "prf_hz": 200, "f0_hz": "10 GHz"},
+    ... }
+    >>> io.read(io.import_recording(path, sidecar, path.with_name("new.npz"))).radar.carrier_hz
+    10000000000.0
+
     The data are in an HDF5 file, a MATLAB file (5 to 7.3), a numpy file, or in flat binary form.
     The sidecar has these sections:
     - `system`: stripmap, isal or path.

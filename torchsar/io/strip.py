@@ -85,6 +85,14 @@ class StripRecording:
 class StripImage:
     """Image in a zarr store of version 3 that is written in blocks of lines; see `create`.
 
+    >>> import tempfile, torch
+    >>> from torchsar import Axis, io
+    >>> axes = Axis("azimuth", 8, 0.0, 2.0, "m"), Axis("range", 4, 9000.0, 3.0, "m")
+    >>> image = io.StripImage.create(tempfile.mkdtemp(), axes, torch.complex64, {}, {})
+    >>> image.write(slice(0, 4), torch.ones(4, 4, dtype=torch.complex64), raw=0)
+    >>> image.is_finished(slice(0, 4)), image.is_finished(slice(4, 8))
+    (True, False)
+
     The store has the arrays `image`, `azimuth` and `range`, as a group of the arrays of a run (see
     `read_images`). Its attributes hold what the image depends on, and the finished blocks with
     checksums of their samples. They are written, in a single file, after the samples of a block: if

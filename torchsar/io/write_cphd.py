@@ -35,6 +35,14 @@ def write_cphd(
 ) -> None:
     """Write range profiles with the positions of their antennas as a CPHD file, version 1.1.0.
 
+    >>> from torchsar import Draws, echo, io, radar, scene
+    >>> flight = scene.Flight(scene.StraightPath([-5e3, 0.0, 3e3], [0.0, 100.0, 0.0]))
+    >>> world = scene.PathWorld(scene.Points(azimuth_m=[0.0], range_m=[0.0]), flight)
+    >>> recording, _ = echo.simulate_path(radar.InverseRadar(1e10, 1e8, 100), world, 8, 8, Draws(1))
+    >>> io.write_cphd(recording, "flight.cphd", radar.LocalFrame(48, 11))  # doctest: +SKIP
+    >>> io.read_cphd("flight.cphd").aux["transmitter_m"].shape  # doctest: +SKIP
+    torch.Size([8, 3])
+
     Samples are written in the domain FX as CF8, with SGN = -1. They are the frequency samples of
     the profiles, rounded to single precision; their phases refer to `scene_reference_m` of the side
     data, by default the origin. If the recording has other reference paths, its samples are turned

@@ -41,6 +41,13 @@ def write_sicd(
 ) -> None:
     """Write a complex image with its geometry as a SICD file (version 1.4.0, NITF).
 
+    >>> from torchsar import Draws, echo, focus, io, radar, scene
+    >>> flight = scene.Flight(scene.StraightPath([-5e3, 0.0, 3e3], [0.0, 100.0, 0.0]))
+    >>> world = scene.PathWorld(scene.Points(azimuth_m=[0.0], range_m=[0.0]), flight)
+    >>> recording, _ = echo.simulate_path(radar.InverseRadar(1e10, 1e8, 100), world, 8, 8, Draws(1))
+    >>> image = (stage := focus.SpotlightImage(recording.aux))(recording.signal)
+    >>> io.write_sicd(image, "a.nitf", recording, stage, radar.LocalFrame(48, 11))  # doctest: +SKIP
+
     The grid is of type PLANE on the imaged plane, and its centre point (SCP) is the middle sample.
     Rows are along the axis of the image that is closest to the line of sight and point away from
     the radar; columns follow a quarter turn later, so that the normal points up. With Sgn = -1 a

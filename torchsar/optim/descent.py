@@ -25,6 +25,12 @@ SUFFICIENT, _CURVATURE = 1e-4, 0.9
 class Descent:
     """Result of a descent, per trial.
 
+    >>> import torch
+    >>> from torchsar.optim import lbfgs
+    >>> found = lbfgs(lambda x: (x - 1).square().sum(-1), torch.zeros(3, 2))  # trials, unknowns
+    >>> found.x.shape, found.converged, bool(found.cost.max() < 1e-6)
+    (torch.Size([3, 2]), tensor([True, True, True]), True)
+
     Args:
         x: Best point, shape (..., n). Where `ok` is False it is the best finite point, or the
             start.

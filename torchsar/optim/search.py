@@ -21,6 +21,13 @@ Population = Callable[[Tensor], Tensor]
 class Searched:
     """Result of a search without gradients, per trial.
 
+    >>> import torch
+    >>> from torchsar.optim import grid_search
+    >>> values = torch.linspace(-1, 1, 5)
+    >>> found = grid_search(lambda x: (x - 0.5).square().sum(-1), [values, values])
+    >>> float(found.cost), int(found.evaluations), found.history.shape
+    (0.0, 25, torch.Size([5, 5]))
+
     Args:
         x: Best point, shape (..., n). Where `ok` is False it is the first candidate.
         cost: Cost at `x`, shape (...,); +inf where `ok` is False.
