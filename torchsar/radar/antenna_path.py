@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -81,7 +82,9 @@ class AntennaPath:
     @property
     def trials(self) -> torch.Size:
         """Leading dimensions."""
-        return torch.broadcast_shapes(self.reference_m.shape[:-1], *(place.shape[:-2] for place in self.places))
+        # the function of torch imports sympy at its first call, which takes half a second
+        shapes = self.reference_m.shape[:-1], *(place.shape[:-2] for place in self.places)
+        return torch.Size(np.broadcast_shapes(*shapes))
 
     @property
     def pulses(self) -> int:
@@ -145,8 +148,8 @@ def broadcast(shapes: Sequence[torch.Size]) -> torch.Size | None:
         Their common shape, None if there is none.
     """
     try:
-        return torch.broadcast_shapes(*shapes)
-    except RuntimeError:
+        return torch.Size(np.broadcast_shapes(*shapes))
+    except ValueError:
         return None
 
 

@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -46,7 +47,7 @@ def trials_of(name: str, profiles: Tensor, frequency_hz: Tensor, antennas: Anten
     size = antennas.pulses, len(frequency_hz)
     if profiles.shape[-2:] != size:
         raise ValueError(f"{name} needs profiles (..., pulse, range) of {size}, got {tuple(profiles.shape)}")
-    return torch.broadcast_shapes(profiles.shape[:-2], antennas.trials)
+    return torch.Size(np.broadcast_shapes(profiles.shape[:-2], antennas.trials))
 
 
 def nothing(present: Tensor, info: dict[str, float], outcome: Outcome | None) -> Estimate:
