@@ -214,7 +214,6 @@ NUMBERS: dict[str, tuple[Callable, dict[str, Any]]] = {
         receive_range,
         {"time_s": ONES, **MOTION, "speed_m_s": 300.0, "channel_m": 1.0},
     ),
-    "scene.gamma_from_normal": (scene.gamma_from_normal, {"x": 0.3 * ONES, "shape": 1.5}),
     "echo.simulate": (stripmap, FAR),
     "echo.simulate_turntable": (turntable, FAR),
     "echo.simulate_bistatic": (bistatic, FAR),

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import conv1d
@@ -117,7 +118,7 @@ class Spline:
         """Evaluate polynomials by Horner's rule, each time in its interval."""
         if isinstance(self.knots, Tensor):
             # knots and times alone have fewer trials than the values, often none
-            few = torch.broadcast_shapes(self.knots.shape[:-1], t.shape[:-1])
+            few = np.broadcast_shapes(self.knots.shape[:-1], t.shape[:-1])
             knots, times = (x.expand(*few, -1).contiguous() for x in (self.knots, t))
             piece = torch.searchsorted(knots[..., 1:-1].detach().contiguous(), times.detach(), right=True)
             offset = (t - knots.gather(-1, piece)) / knots.diff().gather(-1, piece)
@@ -125,7 +126,8 @@ class Spline:
             position = (t.to(torch.float64) - self.knots[0]) / self.knots[1]
             piece = torch.floor(position.detach()).clamp(0, self.values.shape[-1] - 2).to(torch.int64)
             offset, few = position - piece, ()
-        lead = torch.broadcast_shapes(powers[-1].shape[:-1], few)
+        # the function of torch imports sympy at its first call, which takes half a second
+        lead = np.broadcast_shapes(powers[-1].shape[:-1], few)
         total = torch.zeros_like(offset)
         for c in reversed(powers):
             if isinstance(self.knots, Tensor):

@@ -57,7 +57,8 @@ class FoundRotation:
         for name, estimate in estimates.items():
             stage = chain.stages[name]
             held = set() if getattr(stage, "yc_m", 0.0) is None else {"yc_m"}
-            held |= {"omega_rad_s", "yc_m"} if isinstance(stage, CoarseRotation) else set()
+            only_warp = isinstance(stage, CoarseRotation) and not stage.options["fits"]
+            held |= {"omega_rad_s", "yc_m"} if only_warp else set()
             for key in estimate.value.keys() - held:
                 found[key] = estimate.value[key]
                 std.pop(key, None)
