@@ -232,7 +232,7 @@ def path_phase(
     return for_each(find, profiles, antennas, trials)
 
 
-class PathEstimator(Stage):
+class _PathEstimator(Stage):
     """Base class of the stages that estimate errors of pulses through the image along a path.
 
     Args:
@@ -270,7 +270,7 @@ class PathEstimator(Stage):
         return type(self).find(signal.data, frequency_hz, antennas, **self.settings)
 
 
-class PathPhase(PathEstimator):
+class PathPhase(_PathEstimator):
     """Phase per pulse that sharpens the image along any path; see `path_phase`.
 
     Args:
@@ -289,7 +289,7 @@ class PathPhase(PathEstimator):
         super().__init__(height_m=height_m, search=search, polish=polish, assess=assess)
 
 
-class PathAutofocus(PathEstimator):
+class PathAutofocus(_PathEstimator):
     """Error of the recorded path at every pulse, along and across the line of sight.
 
     See `path_autofocus`.

@@ -13,7 +13,7 @@ from torch.nn.functional import normalize
 from torchsar.compensate.path import assess as assessment
 from torchsar.compensate.path.ground import ERROR_DB, corrected, for_each, nothing, slope, trials_of
 from torchsar.compensate.path.joint import cosines, expected_power
-from torchsar.compensate.path.line_of_sight import PathEstimator
+from torchsar.compensate.path.line_of_sight import _PathEstimator
 from torchsar.compensate.path.scatterers import Echoes, prominent_places
 from torchsar.compensate.pulse_phase.data import or_one, without_line
 from torchsar.core import Estimate, Outcome, cis
@@ -155,7 +155,7 @@ def strip_autofocus(
     return for_each(find, profiles, antennas, trials)
 
 
-class StripAutofocus(PathEstimator):
+class StripAutofocus(_PathEstimator):
     """Slow errors of the recorded path of a strip; see `strip_autofocus`.
 
     Args:

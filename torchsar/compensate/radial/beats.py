@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.radial.bands import Bands, Spectra, inside, window_lines
-from torchsar.compensate.radial.blocks import SweepEstimator, Window, velocities
+from torchsar.compensate.radial.blocks import Window, _SweepEstimator, velocities
 from torchsar.compensate.radial.measured import Law, Measured
 from torchsar.compensate.radial.product import climbed
 from torchsar.core import (
@@ -120,7 +120,7 @@ def envelope_lag(bands: Bands, upsampling: int) -> Tensor:
     return (near.argmax(-1) - reach).to(torch.float64) / upsampling
 
 
-class SpectrumCorrelation(SweepEstimator):
+class SpectrumCorrelation(_SweepEstimator):
     """Radial velocity by cross-correlation of range envelopes; see `spectrum_correlation`.
 
     Args:
@@ -291,7 +291,7 @@ def peak_frequencies(bands: Bands, window_m: tuple[float, float] | None) -> tupl
     return frequency[..., 0, :], frequency[..., 1, :], shining(peak[..., 0, :], peak[..., 1, :])
 
 
-class MlPeak(SweepEstimator):
+class MlPeak(_SweepEstimator):
     """Radial velocity by periodogram peaks of one scatterer; see `ml_peak`.
 
     Args:

@@ -117,7 +117,7 @@ def by_trials(
     return Estimate.joined([parts[first] for first in starts], trials)
 
 
-class SweepEstimator(Stage):
+class _SweepEstimator(Stage):
     """An estimator of the radial velocity from both sweeps of a range window.
 
     Args:

@@ -7,7 +7,7 @@ from typing import get_args
 from torch import Tensor
 
 from torchsar.compensate.radial.bands import Bands
-from torchsar.compensate.radial.blocks import SweepEstimator, Window, velocities
+from torchsar.compensate.radial.blocks import Window, _SweepEstimator, velocities
 from torchsar.compensate.radial.measured import Intercept, Law, Measured
 from torchsar.compensate.radial.product import mirror_velocity
 from torchsar.core import (
@@ -123,7 +123,7 @@ def refuse_other_intercept(intercept: str) -> None:
         raise ValueError(f"intercept must be 'known', 'record' or 'free', got {intercept!r}")
 
 
-class MirrorProduct(SweepEstimator):
+class MirrorProduct(_SweepEstimator):
     """Radial velocity by the product of up and mirrored down sweeps; see `mirror_product`.
 
     Provides `velocity_m_s` of shape (..., pulse) at the turning points (ends of the up sweeps),

@@ -16,7 +16,7 @@ from torchsar.compensate.pulse_phase import pga
 from torchsar.compensate.pulse_phase.data import prepare, rotate, starting_phase
 from torchsar.compensate.radial.assess import LEAST_PERIODS, assessed_motion, assessed_velocity
 from torchsar.compensate.radial.bands import Bands, Spectra, filled
-from torchsar.compensate.radial.blocks import SweepEstimator, Window, by_trials
+from torchsar.compensate.radial.blocks import Window, _SweepEstimator, by_trials
 from torchsar.compensate.radial.measured import Intercept
 from torchsar.compensate.radial.mirror import mirror_measured, refuse_other_intercept
 from torchsar.compensate.radial.phases import Walk, linked_walk, scene_cells, sharpened
@@ -256,7 +256,7 @@ def range_error(estimate: Estimate, radar: TriangularLadar, pulse: Axis, at_s: T
     return total
 
 
-class RadialMotion(SweepEstimator):
+class RadialMotion(_SweepEstimator):
     """Radial motion by the recommended estimator; see `radial_motion`.
 
     Provides `velocity_m_s`, which `CompensateMotion` can compensate, and the residual `phase_rad`,

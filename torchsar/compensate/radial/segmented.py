@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchsar.compensate.radial.bands import Bands, Spectra, inside, window_lines
 from torchsar.compensate.radial.beats import envelope_lag, from_beats, shining
-from torchsar.compensate.radial.blocks import SweepEstimator, Window, velocities
+from torchsar.compensate.radial.blocks import Window, _SweepEstimator, velocities
 from torchsar.compensate.radial.measured import Law, Measured
 from torchsar.core import (
     Axis,
@@ -273,7 +273,7 @@ def _weighted(x: Tensor, weights: Tensor) -> Tensor:
     return (x * weights).sum(-2) / weights.sum(-2).clamp_min(torch.finfo(weights.dtype).tiny)
 
 
-class SegmentedInterference(SweepEstimator):
+class SegmentedInterference(_SweepEstimator):
     """Radial velocity by segmented interference; see `segmented_interference`.
 
     Args:
