@@ -95,6 +95,21 @@ def test_examples_run(path: Path) -> None:
     assert found.attempted and not found.failed
 
 
+FACES = ("core", "radar", "scene", "echo", "repair", "compensate", "multichannel", "focus", "metrics", "optim", "io")
+
+
+def test_every_public_name_has_an_example() -> None:
+    """A stage and its function need one between them; values such as `LIGHT_M_S` need none."""
+    found: dict[str, bool] = {}
+    for face in (importlib.import_module(f"torchsar.{name}") for name in FACES):
+        for name in face.__all__:
+            value = getattr(face, name)
+            if inspect.isclass(value) or inspect.isfunction(value):
+                idea = f"{face.__name__}.{name.replace('_', '').lower()}"
+                found[idea] = found.get(idea, False) or ">>>" in (inspect.getdoc(value) or "")
+    assert not [idea for idea, shown in found.items() if not shown]
+
+
 def constant(node: ast.stmt) -> ast.expr | None:
     """The value of a statement that assigns to names in capitals."""
     if not isinstance(node, ast.Assign | ast.AnnAssign):
