@@ -20,7 +20,8 @@ from torchsar.multichannel import (
     noise_gain_db,
 )
 from torchsar.multichannel.azimuth import azimuth_filter
-from torchsar.multichannel.reconstruct import band_matrix, first_bin, refuse_channels, shared_response
+from torchsar.multichannel.reconstruct import refuse_channels
+from torchsar.multichannel.response import band_matrix, first_bin, shared_response
 
 F64, C128 = torch.float64, torch.complex128
 PRF = (125.0, 160.0, 170.0, 180.0, 185.0, 187.0, 187.5, 190.0, 195.0, 200.0, 250.0)

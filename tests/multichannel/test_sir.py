@@ -11,7 +11,7 @@ import torch
 from tests.multichannel.helpers import azimuth_echo, published_radar, range_of, time_of
 from torchsar.core import Signal
 from torchsar.multichannel import LeastSquares, MinimumMeanSquare, PointMotion, SignalIntensityRatio
-from torchsar.multichannel.reconstruct import first_bin
+from torchsar.multichannel.response import first_bin
 from torchsar.multichannel.velocity.sir import signal_intensity
 
 F64 = torch.float64

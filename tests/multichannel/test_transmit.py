@@ -19,7 +19,7 @@ from torchsar.multichannel import (
     remove_transmit_range,
 )
 from torchsar.multichannel.azimuth import azimuth_filter
-from torchsar.multichannel.reconstruct import doppler_centre_hz
+from torchsar.multichannel.response import doppler_centre_hz
 from torchsar.multichannel.transmit import neglected_transmit_phase_rad
 
 K = (-243.0, 0.0208, -1.3e-6, 2e-9)

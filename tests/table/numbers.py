@@ -19,7 +19,7 @@ from torchsar import compensate, core, echo, metrics, multichannel, radar, repai
 from torchsar.core import Draws, Stage
 from torchsar.focus import image_lines, reference
 from torchsar.multichannel.azimuth import azimuth_filter
-from torchsar.multichannel.reconstruct import band_matrix
+from torchsar.multichannel.response import band_matrix
 from torchsar.radar.bistatic import polynomial_range, receive_range
 
 REASONS: dict[str, str] = {

@@ -41,6 +41,7 @@ from torchsar.multichannel.azimuth import (
 )
 from torchsar.multichannel.balance import CorrectBalance, EstimateBalance, correct_balance, estimate_balance
 from torchsar.multichannel.chip import Extraction
+from torchsar.multichannel.detection import detect
 from torchsar.multichannel.limits import multichannel_limits
 from torchsar.multichannel.migration import (
     CorrectMigration,
@@ -52,18 +53,16 @@ from torchsar.multichannel.migration import (
 )
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.reconstruct import (
-    ElementPattern,
-    FlatBand,
     LeastSquares,
     MinimumMeanSquare,
     Reconstruct,
     condition_number,
-    doppler_offsets,
     noise_gain_db,
     reconstruct,
 )
 from torchsar.multichannel.requirements import MultichannelUse, multichannel_requirements
-from torchsar.multichannel.scene_image import Detector, ImageMovers, MoversImage, SceneImage, detect
+from torchsar.multichannel.response import ElementPattern, FlatBand, doppler_offsets
+from torchsar.multichannel.scene_image import Detector, ImageMovers, MoversImage, SceneImage
 from torchsar.multichannel.stationary import StationaryImage, stationary_image
 from torchsar.multichannel.synchronise import EstimateSynchronisation, RemoveSynchronisation
 from torchsar.multichannel.transmit import (

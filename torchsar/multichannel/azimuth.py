@@ -26,7 +26,8 @@ from torchsar.core import (
 )
 from torchsar.multichannel.migration import CorrectMigration, Migration
 from torchsar.multichannel.motion import Number, PointMotion
-from torchsar.multichannel.reconstruct import Rebuild, Reconstruct, doppler_centre_hz
+from torchsar.multichannel.reconstruct import Rebuild, Reconstruct
+from torchsar.multichannel.response import doppler_centre_hz
 from torchsar.multichannel.transmit import CompressChannels, RemoveTransmitRange
 from torchsar.radar import BistaticRadar
 

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from torchsar.core import linear_solve, matrix_inverse
 from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.reconstruct import Prior, band_matrix, doppler_offsets, first_bin, shared_response
+from torchsar.multichannel.response import Prior, band_matrix, doppler_offsets, first_bin, shared_response
 from torchsar.optim.scalar import grid_minimum, parabola_minimum
 from torchsar.radar import BistaticRadar
 

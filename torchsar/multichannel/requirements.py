@@ -19,7 +19,8 @@ from torch import Tensor
 from torchsar.core import cis
 from torchsar.focus.requirements import Requirement, phase_error_db
 from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.reconstruct import LeastSquares, Rebuild, band_matrix, separates
+from torchsar.multichannel.reconstruct import LeastSquares, Rebuild, separates
+from torchsar.multichannel.response import band_matrix
 from torchsar.radar import BistaticRadar
 from torchsar.radar.bistatic import receive_range
 

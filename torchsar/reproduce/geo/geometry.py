@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchsar import plot
 from torchsar.multichannel import PointMotion
-from torchsar.multichannel.reconstruct import doppler_centre_hz, shared_response
+from torchsar.multichannel.response import doppler_centre_hz, shared_response
 from torchsar.radar import TimingDiagram, timing_diagram
 from torchsar.radar.bistatic import receive_range
 from torchsar.radar.timing import off_nadir_ground_m
