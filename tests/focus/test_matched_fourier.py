@@ -26,7 +26,7 @@ from torchsar.focus import (
     matched_fourier,
     range_phase,
 )
-from torchsar.focus.image_lines import cross_range_of, lines_for, mean_rate
+from torchsar.focus.image_lines import cross_range_of, mean_rate
 from torchsar.focus.warped_sums import times_of_even_angle
 from torchsar.metrics import entropy
 from torchsar.radar import LIGHT_M_S, InverseRadar
@@ -315,14 +315,6 @@ def test_no_warp_is_a_plain_transform():
 def test_any_order():
     k, data = torch.tensor([3.0, 200.0, 1e4, -5e5], dtype=torch.float64), noise(N, 1)
     assert relative(matched_fourier(data, k, PRF, transform=Gridding(eps=1e-10)), direct(data, k, 2.0, 2 * N)) < 1e-10
-
-
-def test_lines_for():
-    for cells, oversampling in ((10, 2.0), (157.3, 1.0), (33, 4)):
-        lines = lines_for(cells, oversampling)
-        assert (lines // 2 - 1) / oversampling >= cells > lines // 2 / oversampling * 0.8 and lines % 2 == 0
-    with pytest.raises(ValueError, match="positive number of cells"):
-        lines_for(0.0)
 
 
 def test_fewer_lines_are_the_middle_of_all():

@@ -244,7 +244,6 @@ NUMBERS: dict[str, tuple[Callable, dict[str, Any]]] = {
         lambda **given: image_lines.mean_rate(k=WARP, **given),
         {"omega_rad_s": 0.3, "duration_s": 0.1},
     ),
-    "focus.lines_for": (image_lines.lines_for, {"cells": 5.0, "oversampling": 2.0}),
     "focus.flat_reference": (
         lambda sampling_hz: reference.flat_reference(RADAR.pulse, 64, sampling_hz),
         {"sampling_hz": 5e7},

@@ -18,40 +18,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import per_trial
-from torchsar.focus.nufft import smooth_length
 from torchsar.focus.warped_sums import whole_warp
-
-# far more lines than fit any memory; the search of a fast length would take seconds
-_MOST_LINES = 1e7
-
-
-def lines_for(cells: float, oversampling: float = 2.0) -> int:
-    """Return the number of image lines that cover the Doppler band of a target.
-
-    Use it where the Doppler band of the target is narrower than the pulse rate.
-
-    Args:
-        cells: Half width of the band in Doppler cells, 1 / aperture time; the lines cover
-            -cells..cells.
-        oversampling: Lines per Doppler cell.
-
-    Returns:
-        An even number of lines, with a fast FFT.
-
-    Raises:
-        ValueError: If `cells` or `oversampling` is not positive, or there are too many lines.
-    """
-    if not (math.isfinite(cells) and cells > 0 and oversampling > 0):
-        raise ValueError(
-            f"image lines need a positive number of cells and a positive oversampling, got cells={cells} and "
-            f"oversampling={oversampling}"
-        )
-    if not cells * oversampling < _MOST_LINES:
-        raise ValueError(
-            f"an image has at most {_MOST_LINES:g} lines, got cells={cells} and oversampling={oversampling}; "
-            "check their units"
-        )
-    return 2 * smooth_length(math.ceil(cells * oversampling) + 1)
 
 
 def mean_rate(omega_rad_s: Tensor | float, k: Tensor, duration_s: float) -> Tensor:

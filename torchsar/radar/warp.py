@@ -77,28 +77,7 @@ def coefficients_of(k: Tensor) -> Tensor:
     Returns:
         Coefficients k_i / (i + 1)! of t^2, t^3, ... in the warped time, same shape and units.
     """
-    return k / _factorials(k)
-
-
-def k_of_coefficients(coefficients: Tensor) -> Tensor:
-    """Convert coefficients of the warped time to relative derivatives of the rotation rate.
-
-    This is the inverse of `coefficients_of`.
-
-    Args:
-        coefficients: Coefficients of t^2, t^3, ... in the warped time, in 1/s, 1/s^2, ..., shape
-            (..., order - 1).
-
-    Returns:
-        Derivatives k1, k2, ... of the rotation rate at the first pulse divided by that rate, same
-        shape and units.
-    """
-    return coefficients * _factorials(coefficients)
-
-
-def _factorials(k: Tensor) -> Tensor:
-    """Factorials 2!, 3!, ... that belong to k1, k2, ..."""
-    return torch.tensor([math.factorial(i + 2) for i in range(k.shape[-1])], dtype=k.dtype, device=k.device)
+    return k / k.new_tensor([math.factorial(i + 2) for i in range(k.shape[-1])])
 
 
 def least_rate(k: Tensor, duration_s: float, points: int = 513) -> Tensor:
