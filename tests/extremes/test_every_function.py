@@ -50,7 +50,17 @@ def test_no_public_function_or_stage_is_missing() -> None:
             stage = inspect.isclass(value) and issubclass(value, Stage)
             if (stage or inspect.isfunction(value)) and not {name if stage else "", f"{package}.{name}"} & listed:
                 missing.append(f"{package}.{name}")
-    assert not missing, f"give each of these an entry, or a reason, in table.py: {missing}"
+    assert not missing, f"give each of these an entry, or a reason, in tests/table: {missing}"
+
+
+def test_reasons_stand_for_public_names_without_a_row() -> None:
+    rows = {entry.name.split(":")[0] for entry in ENTRIES} | set(NUMBERS)
+    assert not set(REASONS) & rows
+    for name in (*REASONS, *(row for row in rows if "." in row)):
+        package, _, own = name.rpartition(".")
+        module = importlib.import_module(f"torchsar.{package}")
+        assert hasattr(module, own), name
+        assert name not in REASONS or own in module.__all__, f"{name} is not public and needs no reason"
 
 
 @pytest.mark.parametrize("entry", BATCHES, ids=ids(BATCHES))

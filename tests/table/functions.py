@@ -43,6 +43,11 @@ from torchsar.multichannel.velocity.likelihood import explained_energy, maximum_
 from torchsar.multichannel.velocity.stages import gradient_likelihood
 from torchsar.multichannel.velocity.whitening import line_whitening, sample_whitening
 from torchsar.radar import FarField
+from torchsar.repair.contamination import find_contamination
+from torchsar.repair.jitter import correct_jitter_exact
+from torchsar.repair.lines import place_lines
+from torchsar.repair.response import estimate_amplitude_response
+from torchsar.repair.triangle import split_record
 
 DECHIRPED = replace(TURNTABLE, pulse_s=1e-6)
 F64 = torch.float64
@@ -307,6 +312,33 @@ FUNCTIONS = [
         ),
     ),
     _entry("repair.circular_shift", "record", lambda x: repair.circular_shift(x, 3.3e-6, LADAR), laws=Laws(energy=1)),
+    _entry(
+        "repair.triangle.split_record",
+        "record",
+        lambda x: split_record(x, LADAR, 3.3e-6),
+        laws=Laws(pulse="a sweep may begin in one block and end in the next"),
+    ),
+    _entry(
+        "repair.jitter.correct_jitter_exact",
+        "raw",
+        lambda x: correct_jitter_exact(x, torch.tensor([0.05, -0.03, 0.02, -0.04], dtype=F64)),
+        laws=Laws(range="the jitter has a place on the clock"),
+    ),
+    _entry("repair.contamination.find_contamination", "raw", find_contamination, laws=Laws(steps=("density",))),
+    _entry(
+        "repair.response.estimate_amplitude_response",
+        "wide image",
+        lambda x: estimate_amplitude_response(
+            size(x).double().square().mean(-2), torch.ones(x.shape[-1], dtype=F64), BAND, 8
+        ),
+        0,
+    ),
+    _entry(
+        "repair.lines.place_lines",
+        "raw",
+        lambda x: place_lines(x, (torch.arange(x.shape[-2]) - 1).expand(x.shape[:-1])),
+        laws=Laws(pulse="moves lines to fixed places"),
+    ),
     _entry("repair.find_trigger", "record", lambda x: repair.find_trigger(x, LADAR)),
     _entry(
         "repair.correct_imbalance",
@@ -366,6 +398,12 @@ FUNCTIONS = [
     _entry("compensate.entropy_fixed_point", "raw", compensate.entropy_fixed_point, laws=RANGE_FREE),
     _entry("compensate.link_phases", "raw", compensate.link_phases, laws=RANGE_FREE),
     _entry("compensate.sharpest_phase", "raw", lambda x: compensate.sharpest_phase(x, steps=10), laws=RANGE_FREE),
+    _entry(
+        "compensate.sharpest_phase:contrast",
+        "raw",
+        lambda x: compensate.sharpest_phase(x, objective="contrast", steps=10),
+        laws=RANGE_FREE,
+    ),
     _entry("compensate.phase_polish", "raw", compensate.phase_polish, laws=RANGE_FREE),
     _entry(
         "compensate.rotation_autofocus",
@@ -732,6 +770,12 @@ MORE_STAGES = [
     _on_signal("AlignEnvelopes", "turntable", compensate.AlignEnvelopes, laws=RANGE_FREE),
     _on_signal("PulseGain", "turntable", compensate.PulseGain, laws=RANGE_FREE),
     _on_signal("SharpestPhase", "turntable", lambda: compensate.SharpestPhase(steps=5), laws=RANGE_FREE),
+    _on_signal(
+        "Autofocus:target",
+        "turntable",
+        lambda: compensate.Autofocus(imaging=focus.TargetImage(TURNTABLE)),
+        RANGE_FREE,
+    ),
     Entry(
         "EqualisePulses",
         "turntable",
