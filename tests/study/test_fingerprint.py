@@ -5,13 +5,14 @@ from __future__ import annotations
 import functools
 import importlib
 import json
+import re
 import subprocess
 import sys
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
+from types import MappingProxyType, ModuleType
 from typing import Any
 
 import numpy as np
@@ -100,6 +101,11 @@ def test_another_process_gives_the_same() -> None:
     assert json.loads(done.stdout) == [of(), of(name="object")]
 
 
+@dataclass(frozen=True, slots=True)
+class Slotted:
+    window: int
+
+
 @dataclass(frozen=True)
 class Setting:
     window: int
@@ -130,6 +136,12 @@ PAIRS: list[tuple[Any, Any]] = [
     (closing_over(1), closing_over(2)),
     ("abc".upper, "abd".upper),
     (torch.float32, torch.float64),
+    (np.exp, np.log),
+    (re.compile("a+"), re.compile("a+", re.ASCII)),
+    (MappingProxyType({"a": 1}), MappingProxyType({"a": 2})),
+    (np.random.default_rng(1), np.random.default_rng(2)),
+    (torch.eye(2).to_sparse(), (2 * torch.eye(2)).to_sparse()),
+    (Slotted(3), Slotted(4)),
 ]
 
 
@@ -144,6 +156,15 @@ def test_values_of_many_kinds_are_told_apart(one: Any, other: Any) -> None:
 def test_what_cannot_be_compared_is_refused(value: Any) -> None:
     with pytest.raises(ConfigError, match=r"closing_over.* uses value, .* give a version"):
         fingerprint(closing_over(value))
+
+
+def test_a_name_that_is_assigned_later_counts_as_none() -> None:
+    def trial(parameters: Any, draws: Any) -> Any:
+        return later
+
+    assert fingerprint(trial)["uses"] == {"later": "NoneType None"}
+    later = 1.0
+    assert fingerprint(trial)["uses"] == {"later": "float 1.0"}
 
 
 def test_a_module_counts_by_its_name() -> None:

@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 import argparse
+import copyreg
 import hashlib
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from functools import cached_property
 from pathlib import Path
-from types import CodeType, FunctionType, ModuleType, SimpleNamespace
+from types import (
+    CellType,
+    CodeType,
+    FunctionType,
+    GetSetDescriptorType,
+    MappingProxyType,
+    MemberDescriptorType,
+    ModuleType,
+    SimpleNamespace,
+)
 from typing import Any
 
 import numpy as np
@@ -113,17 +123,20 @@ class _Reader:
             return _parts_of_code(value)
         if isinstance(value, (type, ModuleType)):
             return _parts_of_name(value)
-        if isinstance(value, (Tensor, np.ndarray)):
+        if isinstance(value, np.ndarray) or (isinstance(value, Tensor) and value.layout is torch.strided):
             return (str(value.dtype), tuple(value.shape), _digest(_content(value)))
         if isinstance(value, (list, tuple)):
             return value
         if isinstance(value, (set, frozenset)):
             return sorted(value, key=self.text)
-        if type(value) is dict:
+        if type(value) is dict or isinstance(value, MappingProxyType):
             return sorted(value.items(), key=self.text)
         if isinstance(value, (staticmethod, classmethod, property, cached_property)):
             return [getattr(value, name, None) for name in ("__func__", "fget", "fset", "func")]
-        reduced = value.__reduce_ex__(4)
+        if isinstance(value, (GetSetDescriptorType, MemberDescriptorType)):  # slots, and attributes of classes in C
+            return (value.__qualname__,)
+        pickler = copyreg.dispatch_table.get(type(value))  # comes first, as in pickle
+        reduced = pickler(value) if pickler else value.__reduce_ex__(4)
         pickled = [reduced] if isinstance(reduced, str) else reduced
         parts = [list(part) if isinstance(part, Iterator) else part for part in pickled]
         return [type(value), *parts, getattr(value, "__wrapped__", None)]
@@ -139,7 +152,7 @@ def _own(function: FunctionType) -> list[Any]:
 def _used(function: FunctionType) -> dict[str, Any]:
     """The values that a function closes over and those of the global names that it mentions."""
     cells = zip(function.__code__.co_freevars, function.__closure__ or ())
-    found = {name: cell.cell_contents for name, cell in cells}
+    found = {name: None if cell == CellType() else cell.cell_contents for name, cell in cells}  # None if not assigned
     scope, mentioned = function.__globals__, _names(function.__code__)
     for name in () if _is_library(str(scope.get("__name__"))) else sorted(mentioned & set(scope)):
         value = scope[name]

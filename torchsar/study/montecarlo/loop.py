@@ -206,8 +206,8 @@ def sweep(
             unchanged.
         version: Version of `trial`. A sweep is resumed only by the same version. Without a version,
             it is resumed only if the code of `trial`, what it closes over and the global names that
-            it uses are unchanged; see `fingerprint`. Give a version if these change without an
-            effect on the results, or if results depend on more than these.
+            it uses are unchanged (see `torchsar.study.montecarlo.fingerprint`). Give a version if
+            these change without an effect on the results, or if results depend on more than these.
         random: Source of the random numbers: "numpy" draws them on the CPU, "torch" other ones on
             the device where they are used; see `torchsar.Draws`.
 
@@ -215,7 +215,9 @@ def sweep(
         The results, with the dims (algorithm, *parameters, trial).
 
     Raises:
-        ConfigError: If an argument is invalid, or the trial function fails.
+        ConfigError: If an argument is invalid, the trial function fails, or, with `out` and without
+            `version`, it uses a value that cannot be compared with that of a later run, such as an
+            open file or a lock.
         Interrupted: After Ctrl-C; finished trials are recorded in `out`, if that is given.
     """
     if workers is not None:
