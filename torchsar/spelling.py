@@ -35,18 +35,20 @@ def entries_with(words: Iterable[str], text: str) -> str:
     return "\n".join(found) if wanted else text
 
 
-def did_you_mean(word: str, accepted: Iterable[str]) -> str:
+def did_you_mean(word: str, accepted: Iterable[str], listed: str = "") -> str:
     """Return a hint for an unknown word.
 
     Args:
         word: The word that is not accepted.
         accepted: The words that are.
+        listed: Where a long list of them is found, which replaces them if one is similar.
 
     Returns:
         "; did you mean ...?" with the most similar accepted word, if there is one, and the list of
-        accepted words.
+        accepted words, or `listed`.
     """
     names = sorted(accepted)
     near = difflib.get_close_matches(word, names, n=1, cutoff=0.6)
     hint = f"; did you mean {near[0]!r}?" if near else ""
-    return f"{hint} (accepted: {', '.join(names) or 'nothing'})"
+    shown = listed if near and listed else f"accepted: {', '.join(names) or 'nothing'}"
+    return f"{hint} ({shown})"

@@ -166,7 +166,10 @@ def test_unknown_config_names_what_there_is() -> None:
         (["world.impairments.x.kind=nothing"], ["world.impairments.x.kind", "unknown impairment 'nothing'"]),
         (
             ["processor.recommended.stages.focus.stage=omega"],
-            ["processor.recommended.stages.focus.stage", "unknown stage 'omega'", "did you mean 'omega_k'"],
+            [
+                "processor.recommended.stages.focus.stage",
+                "'omega'; did you mean 'omega_k'? (`torchsar list` shows all)",
+            ],
         ),
         (
             ["processor.recommended.stages.focus.velocity=3"],
@@ -246,6 +249,14 @@ def test_mistakes_are_named(tmp_path: Path, assignments: list[str], expected: li
             ["'processor.recommended.stages.r.order' is now called 'objective.order'"],
         ),
         (["world.noise.order=2"], ["'world.noise.order' is not known"]),
+        (
+            ["processor.recommended.stages.r.stage=rotation_genetic"],
+            ["processor.recommended.stages.r: ", "now called 'stage: rotation_entropy, method: genetic'"],
+        ),
+        (
+            ["processor.recommended.stages.r.stage=rotation_phase_fit"],
+            ["'stage: rotation_phase_fit' is now called 'stage: rotation_coarse, fits: 4'"],
+        ),
     ],
 )
 def test_old_names_are_given_the_new_ones(tmp_path: Path, assignments: list[str], expected: list[str]) -> None:

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from torchsar.study.settings.errors import did_you_mean
 
-# keys and values that were renamed; the message about an old one gives the new one
+# keys, values and stages that were renamed; the message about an old one gives the new one
 RENAMED = {
     "damages": "impairments",
     "told": "trigger_known",
@@ -19,6 +19,12 @@ RENAMED = {
     "damaged": "impaired",
     **{
         key: f"objective.{key}" for key in ("order", "range_term", "yc_m", "variables", "oversampling", "lines", "taps")
+    },
+    "rotation_phase_fit": "rotation_coarse, fits: 4",
+    "rotation_search": "rotation_entropy, method: grid",
+    **{
+        f"rotation_{name}": f"rotation_entropy, method: {name}"
+        for name in ("genetic", "evolution", "newton", "descent")
     },
 }
 

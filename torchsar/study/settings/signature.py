@@ -17,7 +17,7 @@ from pydantic import BaseModel, ValidationError, create_model
 from torch import Tensor
 
 from torchsar.study.settings.errors import ConfigError, did_you_mean, one_line
-from torchsar.study.settings.sentences import Strict, members_of, sentence
+from torchsar.study.settings.sentences import RENAMED, Strict, members_of, sentence
 
 _SCALARS = (float, int, str, bool, type(None))
 _YAML = (*_SCALARS, tuple, list)
@@ -216,7 +216,10 @@ class Catalogue:
         if name == AUTO:
             return entry
         if not isinstance(name, str) or name not in self.entries:
-            hint = did_you_mean(str(name), self.entries)
+            new = RENAMED.get(str(name), "")
+            if new.split(",")[0] in self.entries:
+                raise ConfigError(f"{file}: {where}: '{self.key}: {name}' is now called '{self.key}: {new}'; rename it")
+            hint = did_you_mean(str(name), self.entries, "`torchsar list` shows all" if self.what == "stage" else "")
             raise ConfigError(f"{file}: {where}.{self.key} names an unknown {self.what} {name!r}{hint}")
         return {self.key: name, **self.sections[name].check(rest, where, file)}
 
