@@ -127,6 +127,13 @@ def test_axes_and_images_come_back_exactly(tmp_path: Path) -> None:
         assert found[name].axes == axes and torch.equal(found[name].data, image.data)
 
 
+@pytest.mark.parametrize("name", ["run", "absent"])
+def test_a_folder_without_images_is_named(tmp_path: Path, name: str) -> None:
+    (tmp_path / "run").mkdir()
+    with pytest.raises(FileNotFoundError, match=f"{name} holds no images; give the store of a run, arrays.zarr"):
+        read_images(tmp_path / name)
+
+
 @pytest.fixture
 def strip(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Folder of the result of a small run of stripmap data."""

@@ -11,6 +11,7 @@ from torchsar.core import Draws
 from torchsar.radar import BistaticRadar, LinearFM
 from torchsar.radar.bistatic import receive_range
 from torchsar.scene import (
+    AlwaysLit,
     BandLimited,
     BistaticWorld,
     ExactRange,
@@ -165,3 +166,9 @@ def test_points_may_differ_between_trials_and_be_complex():
 def test_impossible_scenes_are_refused(build, message):
     with pytest.raises(ValueError, match=message):
         build()
+
+
+@pytest.mark.parametrize("gate", [AlwaysLit(), BandLimited, None])
+def test_a_gate_has_the_gain_of_gates(gate):
+    with pytest.raises(TypeError, match=r"weight\(movers, time_s, radar\).*, got "):
+        BistaticWorld(MovingPoints([0.0], [0.0], [0.0], [0.0]), gate)

@@ -69,8 +69,8 @@ def read_images(path: str | Path) -> dict[str, Signal]:
         ValueError: If the store is damaged.
     """
     path = Path(path)
-    if not path.is_dir():
-        raise FileNotFoundError(f"{path} does not exist; give the folder of the result of torchsar run")
+    if not (path / "zarr.json").is_file():
+        raise FileNotFoundError(f"{path} holds no images; give the store of a run, arrays.zarr in its folder")
     zarr = library("zarr", "study", f"reading {path}")
     with reading(path, "the arrays of a run"):
         return dict(_images(zarr, zarr.open_group(str(path), mode="r"), ""))

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from inspect import signature
 from typing import Protocol
 
 import torch
@@ -343,8 +344,13 @@ class BistaticWorld:
             raise TypeError(
                 f"scene must be an object with movers, such as MovingPoints or Ship, or None, got {self.scene!r}"
             )
-        if isinstance(self.gate, type) or not hasattr(self.gate, "weight"):
-            raise TypeError(f"gate must be BandLimited(duration_s) or Pattern(), got {self.gate!r}")
+        gain = getattr(self.gate, "weight", None)
+        taken = signature(gain).parameters if callable(gain) and not isinstance(self.gate, type) else ()
+        if not {"movers", "time_s", "radar"} <= set(taken):
+            raise TypeError(
+                "gate must be an object with weight(movers, time_s, radar), such as BandLimited(duration_s) "
+                f"or Pattern(), got {self.gate!r}"
+            )
         if isinstance(self.receive, type) or not hasattr(self.receive, "range_m"):
             raise TypeError(f"receive must be ExactRange() or TaylorRange(order), got {self.receive!r}")
         if self.scene is None and self.sea is None:
