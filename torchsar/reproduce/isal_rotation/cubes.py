@@ -77,10 +77,8 @@ def _results(signal: Signal, truth: Truth, generations: int) -> tuple[dict[str, 
     corrected = signal.with_data(correct_pulse_phase(signal.data, both["phase_rad"]))
     assert truth.clean is not None
     images = {
-        "no compensation": focused(signal, RADAR, {}),
         "uniform autofocus": focused(uniform, RADAR, {}),
         "autofocus + SM": focused(uniform, RADAR, {"warp_k": second["warp_k"]}),
-        "autofocus + genetic": focused(uniform, RADAR, genetic.value),
         "autofocus + third order": focused(uniform, RADAR, third.value),
         "alternation": focused(corrected, RADAR, both.value),
         "clean reference": focused(truth.clean.signal, RADAR, truth.values),
@@ -126,7 +124,6 @@ def _turntable(small: bool) -> _Seen:
 
 
 def _figure_19(seen: _Seen, path: Path) -> list[Check]:
-    """The image of the genetic algorithm has its own scale, in cross range, from its own rate."""
     names = {
         "a: uniform autofocus": SHOWN[0],
         "b: second order (SM)": SHOWN[1],

@@ -148,7 +148,11 @@ class System(ABC):
     # physics of every system
 
     def simulate(self, bench: Bench, world: Any, draws: Draws) -> Trials:
-        """Simulate the trials in `draws`; numbers of the world may differ between trials."""
+        """Simulate the trials in `draws`; numbers of the world may differ between trials.
+
+        By default the world does so: it has the method `trials_of(radar, draws, dtype, device)`. A
+        system whose world lacks it overrides this one.
+        """
         return world.trials_of(bench.radar, draws, bench.dtype, bench.device)
 
     @abstractmethod
@@ -156,7 +160,11 @@ class System(ABC):
         """Compute the metrics of a method; with `detail` those of single targets as well."""
 
     def samples(self, world: Any, radar: Any) -> int:
-        """Return the number of samples of the raw data of one trial."""
+        """Return the number of samples of the raw data of one trial.
+
+        By default it is the product of `pulses` and `samples` of the world. A system whose world
+        lacks them overrides this method.
+        """
         return world.pulses * world.samples
 
     def may_differ(self, path: str, world: Mapping[str, Any]) -> bool:
