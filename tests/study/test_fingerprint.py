@@ -142,6 +142,7 @@ PAIRS: list[tuple[Any, Any]] = [
     (np.random.default_rng(1), np.random.default_rng(2)),
     (torch.eye(2).to_sparse(), (2 * torch.eye(2)).to_sparse()),
     (Slotted(3), Slotted(4)),
+    (np.array([1, None]), np.array([2, None])),
 ]
 
 

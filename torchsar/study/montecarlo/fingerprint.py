@@ -123,7 +123,8 @@ class _Reader:
             return _parts_of_code(value)
         if isinstance(value, (type, ModuleType)):
             return _parts_of_name(value)
-        if isinstance(value, np.ndarray) or (isinstance(value, Tensor) and value.layout is torch.strided):
+        strided = isinstance(value, Tensor) and value.layout is torch.strided
+        if strided or (isinstance(value, np.ndarray) and not value.dtype.hasobject):
             return (str(value.dtype), tuple(value.shape), _digest(_content(value)))
         if isinstance(value, (list, tuple)):
             return value
@@ -206,8 +207,6 @@ def _content(x: Tensor | np.ndarray) -> bytes:
     if isinstance(x, Tensor):
         plain = x.detach().cpu().resolve_conj().resolve_neg().contiguous().reshape(-1)
         return plain.view(torch.uint8).numpy().tobytes() if plain.numel() else b""
-    if x.dtype.hasobject:
-        raise TypeError("an array of objects")
     return x.tobytes()
 
 
