@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from collections.abc import Callable
 
 import pytest
@@ -75,6 +76,21 @@ def test_the_checks_of_a_stage_are_made_with_one_reading() -> None:
     with pretended_device() as counts:
         made(there(signal()))
     assert counts.waits.total() == 5
+
+
+def test_bad_samples_are_counted_without_a_list_of_them() -> None:
+    bad = torch.full((300, 400), torch.nan, dtype=torch.complex64)
+    tracemalloc.start()
+    with pytest.raises(ValueError, match=r"120000 of 120000 samples are NaN or Inf, the first at index \(0, 0\)"):
+        refuse_non_finite(bad, "image")
+    assert tracemalloc.get_traced_memory()[1] < 1e6
+    tracemalloc.stop()
+    bad[:] = 1
+    bad[7, 2:] = torch.inf
+    with pytest.raises(ValueError, match=r"398 of 120000 .* index \(2, 7\)"):
+        refuse_non_finite(bad.mT, "image")
+    with pytest.raises(ValueError, match=r"1 of 1 .* index \(\)"):
+        refuse_non_finite(torch.tensor(torch.nan), "gain")
 
 
 def test_a_singular_matrix_is_named_by_its_index() -> None:

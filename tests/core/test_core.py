@@ -14,6 +14,7 @@ from torchsar.core import (
     Axis,
     Recording,
     Signal,
+    Stage,
     best_of,
     from_frequency,
     linear_phasor,
@@ -121,6 +122,30 @@ def test_xarray_that_is_missing_is_one_sentence(monkeypatch):
         ModuleNotFoundError, match=r'Signal.to_xarray needs .* xarray: pip install "torchsar-lab\[xarray\]"'
     ):
         ramp().to_xarray()
+
+
+def test_a_package_that_xarray_lacks_is_named(monkeypatch, tmp_path):
+    (tmp_path / "xarray.py").write_text("import absent_part.of_it")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "xarray", raising=False)
+    with pytest.raises(ModuleNotFoundError, match="needs the package absent_part: pip install"):
+        ramp().to_xarray()
+
+
+def test_errors_of_a_constructor_have_one_note_with_its_own_arguments():
+    class Base(Stage):
+        def __init__(self, level):
+            super().__init__()
+            self.level = level + 1
+
+    class Derived(Base):
+        def __init__(self, name):
+            super().__init__(name * 2)
+
+    for made in (Derived, type("Inherited", (Derived,), {})):
+        with pytest.raises(TypeError) as caught:
+            made("a")
+        assert caught.value.__notes__ == [f"{made.__name__}(name) was given ('a',) and {{}}"]
 
 
 def test_conversion_of_a_recording_changes_only_the_dtype_of_samples():

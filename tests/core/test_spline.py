@@ -71,6 +71,9 @@ def test_invalid_input_raises() -> None:
         Spline(torch.zeros(3, 1, dtype=torch.float64), (0.0, 1.0))
     with pytest.raises(ValueError, match="positive step"):
         Spline(torch.zeros(4, dtype=torch.float64), (0.0, 0.0))
+    for wrong in ([0.0, 5.0, 6.0], np.arange(4.0), None, (0.0,), (0.0, "1")):
+        with pytest.raises(TypeError, match=r"float64 knots in a tensor, or a tuple \(start, step\) of numbers, got "):
+            Spline(torch.zeros(4, dtype=torch.float64), wrong)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("n", [2, 3, 4, 5, 6, 40])
@@ -79,10 +82,16 @@ def test_uneven_knots_equal_scipy(n: int) -> None:
     for rows in (made.uniform(0.1, 1.9, (3, n)), 10.0 ** made.uniform(-3, 3, (3, n))):
         at, values = rows.cumsum(-1), made.standard_normal((2, 3, n))
         t = np.stack([np.linspace(k[0] - 0.5, k[-1] + 0.5, 57) for k in at])
-        found = Spline(torch.tensor(values), torch.tensor(at)).at(torch.tensor(t))
+        spline = Spline(torch.tensor(values), torch.tensor(at))
+        found, area, pieces = spline.at(torch.tensor(t)), spline.integral(torch.tensor(t)), spline.pieces()
         for i in range(3):
-            known = torch.tensor(CubicSpline(at[i], values[:, i], axis=-1)(t[i]))
-            assert float((found[:, i] - known).abs().max()) < 1e-10 * max(1.0, float(known.abs().max()))
+            curve = CubicSpline(at[i], values[:, i], axis=-1)
+            pairs = [(found[:, i], curve(t[i])), (area[:, i], curve.antiderivative()(t[i]))]
+            # each coefficient by what it adds at the end of its interval
+            ends = np.diff(at[i])[:, None] ** np.arange(4)
+            pairs.append((pieces[:, i] * torch.tensor(ends), np.moveaxis(curve.c[::-1], 0, -1).swapaxes(0, 1) * ends))
+            for ours, known in pairs:
+                assert float((ours - torch.tensor(known)).abs().max()) < 1e-10 * max(1.0, float(np.abs(known).max()))
     assert Spline(torch.tensor(values), torch.tensor(at[0])).at(torch.tensor(t[0])).shape == (2, 3, 57)
 
 

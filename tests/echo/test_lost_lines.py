@@ -7,7 +7,7 @@ import torch
 
 from tests.helpers import small_radar
 from torchsar.core import Draws, Recording, Signal
-from torchsar.echo import CorruptedNumbers, LostGaps, LostLines, RepeatedLines, apply_impairments
+from torchsar.echo import CorruptedNumbers, LostGaps, LostLines, LostPulses, RepeatedLines, apply_impairments
 
 N = 200
 
@@ -83,6 +83,8 @@ def test_impairments_depend_on_their_address_only() -> None:
         (lambda: LostLines(count=N)(recording(None), Draws(0)), "leave nothing of a recording of 200 lines"),
         (lambda: LostGaps(30, 8)(recording(None), Draws(0)), "do not fit a recording of 200 lines"),
         (lambda: LostLines(count=3)(recording(None), Draws(0, trials=range(2))), "use draws without trials"),
+        (lambda: LostLines(count=3)(recording(3), Draws(0, trials=[1])), r"shape \(3,\), got trials of shape \(1,\)"),
+        (lambda: LostPulses(count=3)(recording(3), Draws(0, trials=[1])), r"shape \(3,\), got trials of shape \(1,\)"),
     ],
 )
 def test_invalid_parameters_are_refused(build, message: str) -> None:

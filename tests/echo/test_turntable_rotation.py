@@ -302,7 +302,7 @@ REFUSED = {
     ),
     "k scalar": (
         lambda: PolynomialRotation(0.02, torch.tensor(10.0)),
-        r"k of a rotation must be a sequence .*, got a tensor without dims; write \(k1,\)",
+        r"k of a rotation must be a sequence of numbers, got tensor\(10.\); put one number in brackets",
     ),
     "both": (
         lambda: TurntableWorld(CUBES, 0.02, rotation=ROTATION),

@@ -12,7 +12,7 @@ from torchsar.core import Draws, Signal
 from torchsar.echo import simulate
 from torchsar.focus import OmegaK, RangeCompress, StoredOmegaK
 from torchsar.metrics import entropy, error_db, impulse_response
-from torchsar.radar import LinearFM, StripmapRadar
+from torchsar.radar import InverseRadar, LinearFM, StripmapRadar
 from torchsar.scene import Dwell, Points, StripmapWorld
 
 
@@ -101,6 +101,14 @@ def test_focusing_is_unitary_up_to_the_range_filter():
 def test_nonsense_instruments_are_refused():
     with pytest.raises(ValueError, match=r"radar\.prf_hz must be a positive number, got nan"):
         small_radar(prf_hz=float("nan"))
+    with pytest.raises(ValueError, match=r"radar\.integration_s must be a positive number or None, got -1"):
+        small_radar(integration_s=-1.0)
+    with pytest.raises(ValueError, match="StripmapRadar: carrier_hz must be a number, got '400'"):
+        small_radar(carrier_hz="400")
+    with pytest.raises(ValueError, match="InverseRadar: carrier_hz must be a number, got None"):
+        InverseRadar(None, None, None)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="InverseRadar: reference_range_m must be a number, got None"):
+        InverseRadar(1e10, 1e9, 100.0, reference_range_m=None)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="exceeds the complex sampling rate"):
         StripmapRadar(3e9, LinearFM(100e6, 1e-6), 50e6, 100.0, 100.0, 1000.0)
     with pytest.raises(ValueError, match="direction"):

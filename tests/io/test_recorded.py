@@ -57,6 +57,7 @@ def test_axes_chirp_and_gain_come_from_the_file(tmp_path):
             "raw.npz: iq must hold plain numbers without pickled objects, got object",
         ),
         ({"iq": np.zeros((6, 80, 2), bool)}, "iq must be complex .* got bool"),
+        ({"f0_hz": 5.3e6}, r"f0_hz is 5.3e\+06 Hz, and should be 1.9986e\+07 to 9.993e\+15 Hz; check it"),
         ({"fs_hz": 0.0}, "raw.npz: fs_hz must be one positive number, got 0.0"),
         ({"fs_hz": np.array([50e6])}, r"fs_hz must be one positive number, got float64 of shape \(1,\)"),
         ({"f0_hz": "high"}, "f0_hz must be one positive number, got 'high'"),
@@ -87,7 +88,7 @@ def test_invalid_files_raise_with_the_name_of_the_key(tmp_path, changes, match):
 
 
 def test_missing_files_and_files_of_other_formats_raise(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"absent\.npz does not exist"):
+    with pytest.raises(FileNotFoundError, match=r"absent\.npz does not exist; give .* with raw stripmap data$"):
         read_stripmap(tmp_path / "absent.npz")
     (tmp_path / "text.npz").write_text("not an archive")
     with pytest.raises(ValueError, match="text.npz must be a numpy archive .* but it is a file of another kind"):

@@ -43,11 +43,15 @@ def refuse_non_finite(
     x = x.detach().resolve_conj()
 
     def refuse(finite: bool) -> None:
+        if finite:
+            return
+        bad = ~torch.isfinite(x)
+        count = int(bad.sum())
         # the sum of finite samples may overflow
-        bad = [] if finite else (~torch.isfinite(x)).nonzero().tolist()
-        if bad:
+        if count:
+            first = tuple(map(int, torch.unravel_index(bad.view(torch.uint8).argmax(), x.shape)))
             raise ValueError(
-                f"{what}: {len(bad)} of {x.numel()} {noun} are NaN or Inf, the first at index {tuple(bad[0])}; {advice}"
+                f"{what}: {count} of {x.numel()} {noun} are NaN or Inf, the first at index {first}; {advice}"
             )
 
     total = torch.view_as_real(x).sum() if x.is_complex() else x.sum()

@@ -185,8 +185,9 @@ class Signal(Shown):
         try:
             xarray = importlib.import_module("xarray")
         except ModuleNotFoundError as error:
+            package = (error.name or "xarray").partition(".")[0]
             raise ModuleNotFoundError(
-                'Signal.to_xarray needs the package xarray: pip install "torchsar-lab[xarray]"'
+                f'Signal.to_xarray needs the package {package}: pip install "torchsar-lab[xarray]"'
             ) from error
         count = len(self.trials)
         trials = ("trial",) if count == 1 else tuple(f"trial_{i}" for i in range(count))

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Real
 
 import numpy as np
 import torch
@@ -39,7 +40,8 @@ class Spline:
             faster; or the times of all knots, rising, shape (..., n), float64.
 
     Raises:
-        TypeError: If values or knots are not float64.
+        TypeError: If values or knots are not float64, or the knots neither a tensor nor a tuple of
+            two numbers.
         ValueError: If there are fewer than two values, the numbers of knots and values differ, the
             knots do not rise, or start or step are not finite.
     """
@@ -59,6 +61,10 @@ class Spline:
         if isinstance(self.knots, Tensor):
             if not bool((self.knots.detach().diff() > 0).all()):
                 raise ValueError("the knots of a spline must rise; sort them and remove doubled ones")
+        elif not isinstance(self.knots, tuple) or [isinstance(x, Real) for x in self.knots] != [True, True]:
+            raise TypeError(
+                f"a spline needs float64 knots in a tensor, or a tuple (start, step) of numbers, got {self.knots!r:.80}"
+            )
         elif not all(map(math.isfinite, self.knots)) or not self.knots[1] > 0:
             raise ValueError(f"a spline needs a finite start and a positive step, got (start, step)={self.knots}")
 

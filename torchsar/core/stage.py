@@ -134,8 +134,10 @@ def _explained(init: Callable[..., None]) -> Callable[..., None]:
         try:
             init(self, *args, **kwargs)
         except (TypeError, AttributeError) as error:
-            given = textwrap.shorten(f"{args} and {kwargs}", 200)
-            error.add_note(f"{type(self).__name__}{inspect.signature(type(self))} was given {given}")
+            # not that of a base class, whose arguments are others
+            if type(self).__init__ is explained:
+                given = textwrap.shorten(f"{args} and {kwargs}", 200)
+                error.add_note(f"{type(self).__name__}{inspect.signature(type(self))} was given {given}")
             raise
 
     return explained

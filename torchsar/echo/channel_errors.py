@@ -139,8 +139,9 @@ class SynchronisationError:
         direct_samples: Number of samples of the direct path, at least 8.
 
     Raises:
-        ValueError: If a number is not finite or direct_samples is below 8; when applied, if delays
-            are given for azimuth-only data or exceed a quarter of the samples of the direct path.
+        ValueError: If a number is not finite, a polynomial is no list or direct_samples is below 8;
+            when applied, if delays are given for azimuth-only data or exceed a quarter of the
+            samples of the direct path.
     """
 
     phase_rad: Sequence[Tensor | float] | None = None
@@ -153,6 +154,13 @@ class SynchronisationError:
     direct_samples: int = 64
 
     def __post_init__(self) -> None:
+        for name in ("phase_rad", "delay_s"):
+            value = getattr(self, name)
+            if not (value is None or isinstance(value, list | tuple)):
+                raise ValueError(
+                    f"{name} of clock errors must be a list of coefficients, got {value!r:.80}; put a single "
+                    "coefficient in brackets"
+                )
         if not self.direct_samples >= 8:
             raise ValueError(
                 f"a direct path needs at least 8 samples per pulse, got direct_samples={self.direct_samples}"

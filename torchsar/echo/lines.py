@@ -38,13 +38,12 @@ def _valid_count(number: Tensor, draws: Draws) -> Tensor:
 def _order(draws: Draws, purpose: str, n: Tensor, number: Tensor) -> Tensor:
     """The numbers 0..n-1 in random order for each trial, (*trials, largest n)."""
     order = draws.permutation(purpose, n.tolist(), number.device)
-    try:
-        return order.expand(*number.shape[:-1], -1)
-    except RuntimeError:
+    if order.shape[:-1] not in ((), number.shape[:-1]):
         raise ValueError(
             f"draws must have the trials of the recording, of shape {tuple(number.shape[:-1])}, got trials of shape "
             f"{tuple(order.shape[:-1])}; use draws without trials for a single recording"
-        ) from None
+        )
+    return order.expand(*number.shape[:-1], -1)
 
 
 def _at(index: Tensor, n: int) -> Tensor:

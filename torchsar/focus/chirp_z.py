@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import centred_fft, checked_samples, host_value, linear_phasor, per_trial, unit_phasor
-from torchsar.focus.nufft import smooth_length
+from torchsar.core.fft import smooth_length
 
 
 def chirp_z(

@@ -22,7 +22,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchsar.core import checked_samples, host_largest, real_dtype
-from torchsar.core.fft import smooth_length as smooth_length
+from torchsar.core.fft import smooth_length
 
 
 @dataclass(frozen=True)

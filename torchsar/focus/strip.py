@@ -22,8 +22,8 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Axis, Signal, Stage
+from torchsar.core.fft import smooth_length
 from torchsar.focus.frame_geometry import BAND_EDGE, raised_cosine_band
-from torchsar.focus.nufft import smooth_length
 from torchsar.focus.omega_k import Focuser, OmegaK
 from torchsar.focus.range_doppler import RangeDoppler
 from torchsar.focus.stolt import OmegaKStolt

@@ -92,7 +92,7 @@ def archive(path: Path, content: str) -> ArrayFile:
         FileNotFoundError: If there is no such file.
         ValueError: If the file is not an archive.
     """
-    refuse_absent(path, f"an .npz file with {content}, such as data.file")
+    refuse_absent(path, f"an .npz file with {content}")
     fields = ArrayFile(path)
     if "" in fields:
         raise ValueError(f"{path} must be a numpy archive (.npz) with {content}, but it holds a single array (.npy)")

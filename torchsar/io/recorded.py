@@ -24,7 +24,6 @@ _REQUIRED = ("iq", "fs_hz", "prf_hz", "f0_hz", "chirp_rate_hz_s", "pulse_s", "sl
 _RANGES = {
     "fs_hz": (1e3, 1e13, "Hz"),
     "prf_hz": (1e-3, 1e8, "Hz"),
-    "f0_hz": (1e2, 1e16, "Hz"),
     "pulse_s": (1e-10, 10.0, "s"),
     "slant_range_cell1_m": (0.1, 1e9, "m"),
     "v_eff_m_s": (1e-3, 3e4, "m/s"),
@@ -98,7 +97,7 @@ def describe_stripmap(fields: Mapping[str, StoredArray], path: Path) -> Describe
             f"got {iq.described}"
         )
     with naming(path):
-        _refuse_implausible(numbers)
+        _refuse_implausible(numbers, c)
         rate, duration, fs = numbers["chirp_rate_hz_s"], numbers["pulse_s"], numbers["fs_hz"]
         radar = StripmapRadar(
             carrier_hz=numbers["f0_hz"],
@@ -118,9 +117,11 @@ def _samples(iq: np.ndarray) -> np.ndarray:
     return iq if iq.ndim == 2 else joined(iq[..., 0], iq[..., 1])
 
 
-def _refuse_implausible(numbers: Mapping[str, float]) -> None:
-    """Raise ValueError for numbers that no recording has."""
-    for key, (low, high, unit) in _RANGES.items():
+def _refuse_implausible(numbers: Mapping[str, float], c: float) -> None:
+    """Raise ValueError for numbers that no recording has; c in m/s."""
+    # wavelengths of 15 m to 30 nm, chosen likewise
+    ranges = {**_RANGES, "f0_hz": (c / 15, c / 3e-8, "Hz")}
+    for key, (low, high, unit) in ranges.items():
         if not low <= numbers[key] <= high:
             raise ValueError(f"{key} is {numbers[key]:g} {unit}, and should be {low:g} to {high:g} {unit}; check it")
     carrier, band = numbers["f0_hz"], abs(numbers["chirp_rate_hz_s"]) * numbers["pulse_s"]

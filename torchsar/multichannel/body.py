@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Outcome, unit_level, worst
-from torchsar.focus.nufft import smooth_length
+from torchsar.core.fft import smooth_length
 from torchsar.multichannel.channels import checked_channels
 from torchsar.multichannel.chip import TINY, Chip, Extraction, Picture, chip_about
 from torchsar.multichannel.migration import Frame, envelope_phasor

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import fields
+from numbers import Real
 
 LIGHT_M_S = 299_792_458.0  # speed of light in vacuum, by definition of the metre
 
@@ -21,10 +23,17 @@ class Instrument:
     def refuse_not_positive(self, *names: str) -> None:
         """Raise ValueError unless the carrier, the wave speed and further fields are positive.
 
+        All fields whose annotations are numbers must hold numbers, or None where that is annotated.
+
         Args:
             *names: Names of fields that hold numbers, or None where they have no value.
         """
-        for name in ("carrier_hz", "wave_speed_m_s", *names):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise ValueError(f"radar.{name} must be a positive number, got {value}")
+        for field in fields(self):  # type: ignore[arg-type]
+            name, value, hint = field.name, getattr(self, field.name), str(field.type)
+            optional = " or None" if "None" in hint else ""
+            if optional and value is None:
+                continue
+            if hint.startswith("float") and not isinstance(value, Real):
+                raise ValueError(f"{type(self).__name__}: {name} must be a number{optional}, got {value!r}")
+            if name in ("carrier_hz", "wave_speed_m_s", *names) and not 0 < float(value) < math.inf:
+                raise ValueError(f"radar.{name} must be a positive number{optional}, got {value}")

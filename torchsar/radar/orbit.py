@@ -117,7 +117,7 @@ def _radians(degrees: Tensor | float, like: Tensor) -> Tensor:
     return per_trial(degrees, 1, like) * (math.pi / 180)
 
 
-def eccentric_anomaly(mean_rad: Tensor, eccentricity: Tensor, steps: int = 30) -> Tensor:
+def eccentric_anomaly(mean_rad: Tensor, eccentricity: Tensor) -> Tensor:
     """Solve Kepler's equation E - e sin E = M by Newton's method.
 
     Autograd differentiates only the last Newton step, whose gradient at the solution is that of E.
@@ -125,8 +125,6 @@ def eccentric_anomaly(mean_rad: Tensor, eccentricity: Tensor, steps: int = 30) -
     Args:
         mean_rad: Mean anomaly M in radians.
         eccentricity: Eccentricity e; broadcasts with `mean_rad`.
-        steps: Number of steps, a fixed one for all trials. Seven reach 1e-15 rad at eccentricity
-            0.9.
 
     Returns:
         Eccentric anomaly E in radians.
@@ -137,7 +135,8 @@ def eccentric_anomaly(mean_rad: Tensor, eccentricity: Tensor, steps: int = 30) -
 
     with torch.no_grad():
         solution = mean_rad + eccentricity * torch.sin(mean_rad)
-        for _ in range(steps):
+        # as many for all trials; seven reach 1e-15 rad at eccentricity 0.9
+        for _ in range(30):
             solution = stepped(solution)
     return stepped(solution)
 

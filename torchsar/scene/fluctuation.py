@@ -294,7 +294,8 @@ class MeasuredTrack(Motion):
 
     Raises:
         ValueError: If the numbers of times and displacements differ, one is not finite, or the
-            times are not equally spaced.
+            times are not equally spaced; when evaluated, if a time is more than one step beyond the
+            ends.
     """
 
     time_s: Tensor

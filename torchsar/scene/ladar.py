@@ -111,7 +111,7 @@ class LadarWorld:
                 raise ValueError(f"{sentence}, got {self.gate_m}")
             low, high = self.gate_m
             refuse_unless(sentence, low, lambda x: x < high, f"high is {high}")
-        if not isinstance(self.fidelity, Fidelity):
+        if isinstance(self.fidelity, type) or not hasattr(self.fidelity, "sweep_range_m"):
             raise TypeError(
                 "fidelity must be LinearInSweep(), QuadraticInSweep(), EverySample(), OnePerSweep() "
                 f"or OnePerPeriod(), got {self.fidelity!r}"

@@ -433,6 +433,9 @@ class Fleet(MovingScene):
 
     Args:
         parts: Scenes by name; the random numbers of each scene depend on its name.
+
+    Raises:
+        ValueError: When movers are made, if there is no scene.
     """
 
     parts: Mapping[str, MovingScene]

@@ -34,7 +34,7 @@ class Ground(Protocol):
 @dataclass(frozen=True)
 @finite_numbers("a ground plane")
 class PlaneGround(Ground):
-    """Plane z = height + slope_x x + slope_y y.
+    """Plane z = level_m + slope_x x + slope_y y.
 
     >>> import torch
     >>> from torchsar import scene

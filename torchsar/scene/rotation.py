@@ -56,14 +56,7 @@ class PolynomialRotation:
 
     def _terms(self) -> Sequence[Tensor | float]:
         """k1, k2, ... one by one."""
-        if not isinstance(self.k, Tensor):
-            return tuple(self.k)
-        if not self.k.ndim:
-            raise ValueError(
-                "k of a rotation must be a sequence (k1, k2, ...) or a tensor (..., order - 1), got "
-                "a tensor without dims; write (k1,)"
-            )
-        return self.k.unbind(-1)
+        return self.k.unbind(-1) if isinstance(self.k, Tensor) else tuple(self.k)
 
     def omega(self, like: Tensor) -> Tensor:
         """Return the rate at the first pulse.

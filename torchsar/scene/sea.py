@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, real_dtype, refuse_non_finite
-from torchsar.scene.trials import finite_numbers, refuse_unless, with_dims
+from torchsar.scene.trials import finite, finite_numbers, refuse_unless, with_dims
 
 # range in standard deviations and number of entries of the table of gamma numbers: linear
 # interpolation between them errs by less than 1e-4
@@ -60,11 +60,9 @@ class Sea(ABC):
     lobes: int = 1
 
     def __post_init__(self) -> None:
-        if self.margin_s is not None and not (math.isfinite(self.margin_s) and self.margin_s >= 0):
-            raise ValueError(
-                "margin_s of a sea must be 0 s or more, or None to reach to the edge of the illumination, got "
-                f"{self.margin_s}"
-            )
+        if self.margin_s is not None:
+            sentence = "margin_s of a sea must be 0 s or more, or None to reach to the edge of the illumination"
+            refuse_unless(sentence, self.margin_s, lambda x: finite(x) & (x >= 0))
         if not (isinstance(self.lobes, int) and self.lobes >= 1):
             raise ValueError(
                 f"lobes of a sea must be a whole number of 1 or more, got {self.lobes}; it counts the nulls of the "

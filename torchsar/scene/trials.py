@@ -31,11 +31,15 @@ def refuse_unless(sentence: str, value: Tensor | float, within: Callable[[Any], 
         advice: What to try instead, empty for no advice.
 
     Raises:
-        ValueError: If an entry violates the condition; the message holds the first such entry.
+        ValueError: If an entry violates the condition, the message then holds the first such entry,
+            or the value is no number.
     """
     if isinstance(value, float | int) and within(value) is True:
         return
-    x = torch.as_tensor(value, dtype=torch.float64).detach()
+    try:
+        x = torch.as_tensor(value, dtype=torch.float64).detach()
+    except (TypeError, ValueError, RuntimeError):
+        raise ValueError(f"{sentence}, got {value!r}") from None
     good = within(x)
     if bool(good.all()):
         return
@@ -47,15 +51,12 @@ def refuse_unless(sentence: str, value: Tensor | float, within: Callable[[Any], 
     raise ValueError(f"{sentence}, got {got}" + (f"; {advice}" if advice else ""))
 
 
-def refuse_unless_finite(
-    what: str, value: Tensor | float | Sequence[Tensor | float] | None, least: float = -math.inf
-) -> None:
+def refuse_unless_finite(what: str, value: Tensor | float | Sequence[Tensor | float], least: float = -math.inf) -> None:
     """Raise ValueError unless every entry of a parameter is finite and not below a limit.
 
     Args:
         what: Name of the parameter for the message.
-        value: Number, one value per trial of shape (...,), a sequence of such values, or None,
-            which is accepted.
+        value: Number, one value per trial of shape (...,), or a sequence of such values.
         least: Smallest accepted value.
 
     Raises:
@@ -66,30 +67,30 @@ def refuse_unless_finite(
             return
         for entry in value:
             refuse_unless_finite(what, entry, least)
-    elif value is not None:
+    else:
         bound = "" if least == -math.inf else f" of {least:g} or more"
         sentence = f"{what} must be a finite number{bound}, or one per trial"
         refuse_unless(sentence, value, lambda x: finite(x) & (x >= least))  # type: ignore[arg-type]
 
 
-def refuse_unless_positive(what: str, value: Tensor | float | None) -> None:
+def refuse_unless_positive(what: str, value: Tensor | float) -> None:
     """Raise ValueError unless every entry of a parameter is positive and finite.
 
     Args:
         what: Name of the parameter for the message.
-        value: Number, one value per trial of shape (...,), or None, which is accepted.
+        value: Number, or one value per trial, shape (...,).
 
     Raises:
         ValueError: If an entry is not finite or not above 0.
     """
-    if value is not None:
-        refuse_unless(f"{what} must be a positive number", value, positive)
+    refuse_unless(f"{what} must be a positive number", value, positive)
 
 
 def finite_numbers(whose: str = "", **limits: float | str | None) -> Callable[[type[_Class]], type[_Class]]:
     """Let a dataclass refuse numbers that are not finite. Write the decorator below `@dataclass`.
 
     It examines all fields whose annotations name floats, before the `__post_init__` of the class.
+    None is accepted only where the annotation of the field names it.
 
     Args:
         whose: What the class describes, such as "a ship", for messages.
@@ -105,8 +106,14 @@ def finite_numbers(whose: str = "", **limits: float | str | None) -> Callable[[t
         names = [name for name, hint in cls.__annotations__.items() if "float" in hint]
 
         def examine(self: Any) -> None:
+            hints = {field.name: str(field.type) for field in fields(self)}
             for name in names:
-                what, value, limit = f"{name} of {whose}" if whose else name, getattr(self, name), limits.get(name, "")
+                what = f"{name} of {whose}" if whose else f"{type(self).__name__}.{name}"
+                if "None" in hints[name] and getattr(self, name) is None:
+                    continue
+                value, limit = getattr(self, name), limits.get(name, "")
+                if hints[name].startswith("Sequence") and not (hasattr(value, "__len__") and getattr(value, "ndim", 1)):
+                    raise ValueError(f"{what} must be a sequence of numbers, got {value!r}; put one number in brackets")
                 if limit == "positive":
                     refuse_unless_positive(what, value)
                 elif limit is not None:

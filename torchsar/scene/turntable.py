@@ -280,5 +280,5 @@ def pulse_length_s(radar: InverseRadar) -> float:
         ValueError: If it is not set.
     """
     if radar.pulse_s is None:
-        raise ValueError("radar.pulse_s is not set; give the pulse length (s), which dechirped pulses need")
+        raise ValueError("radar.pulse_s is not set; give the pulse length (s), on which phases within a pulse depend")
     return radar.pulse_s

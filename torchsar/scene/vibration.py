@@ -118,6 +118,7 @@ class Sinusoid(Motion):
 
 
 @dataclass(frozen=True)
+@finite_numbers("a translation", coefficients_m=None)
 class Polynomial(Motion):
     """Translation d(t) = c1 t + c2 t^2 + ...
 

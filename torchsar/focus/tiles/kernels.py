@@ -8,7 +8,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.focus.nufft import smooth_length
+from torchsar.core.fft import smooth_length
 
 # fineness of the nodes over cross range relative to the band of a tile, by choice: between 2, which
 # has a third more nodes, and 1.25, which needs wider kernels

@@ -20,8 +20,8 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchsar.core import host_value
+from torchsar.core.fft import smooth_length
 from torchsar.focus.image_grid import ImageGrid
-from torchsar.focus.nufft import smooth_length
 from torchsar.focus.tiles.expansion import Expansion, curvatures, slopes
 from torchsar.focus.tiles.kernels import CROSS_OVERSAMPLING
 

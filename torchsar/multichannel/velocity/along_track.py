@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Estimate, Outcome, unit_phasor
-from torchsar.focus.nufft import smooth_length
+from torchsar.core.fft import smooth_length
 from torchsar.multichannel.channels import checked_channels
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture, Kept, seen_aperture

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Outcome, unit_level, unit_phasor, worst
-from torchsar.focus.nufft import smooth_length
+from torchsar.core.fft import smooth_length
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture, Kept, lit_as_expected
 from torchsar.multichannel.velocity.likelihood import maximum_likelihood

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import host_values, level_of, per_trial, unit_phasor
-from torchsar.focus.nufft import smooth_length
+from torchsar.core.fft import smooth_length
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture
 from torchsar.multichannel.velocity.model import chosen, point_phasor
