@@ -17,6 +17,7 @@ from torchsar.multichannel import (
     correct_balance,
     estimate_balance,
 )
+from torchsar.multichannel.clutter_fit import ClutterModel
 
 PHASE, GAIN, DELAY = (
     torch.tensor(x, dtype=torch.float64) for x in ([0.3, 0.0, -0.5], [0.5, 0.0, -1.0], [2e-9, 0.0, -9e-9])
@@ -204,10 +205,32 @@ def test_trials_are_independent_and_empty_ones_not_ok():
     torch.testing.assert_close(single["phase_rad"], together["phase_rad"], atol=1e-4, rtol=0)
 
 
+@pytest.mark.parametrize("spacing_m, prior, bands", [(0.8, FlatBand(360.0), 2), (0.5, ElementPattern(), 14)])
+def test_snr_of_the_expected_covariance(spacing_m, prior, bands):
+    """The last parabola of the search was so wide that the SNR erred by 0.05 to 0.3 dB."""
+    radar = published_radar(channel_m=(-spacing_m, 0.0, spacing_m))
+    model = ClutterModel.of(radar, prior, 64, bands, torch.device("cpu"))
+    snr_db = torch.tensor([-10.0, -7.5, 10.0, 20.5, 31.0], dtype=torch.float64)
+    torch.testing.assert_close(model.snr_db(model.noisy(snr_db)), snr_db, atol=0.01, rtol=0)
+
+
+def test_phases_in_single_precision_are_removed():
+    radar, data = published_radar(), torch.ones(3, 4, 8, dtype=torch.complex128)
+    expected = correct_balance(data, radar, PHASE.float().double(), GAIN, DELAY)
+    torch.testing.assert_close(correct_balance(data, radar, PHASE.float(), GAIN, DELAY), expected)
+    single = CorrectBalance(radar)(Signal(data, radar.axes(4, 8)), PHASE.float(), GAIN.float(), DELAY.float())
+    torch.testing.assert_close(single.data, expected, atol=1e-5, rtol=0)
+
+
 def test_refusals():
-    radar = published_radar()
-    with pytest.raises(ValueError, match="at least two positions"):
-        estimate_balance(torch.zeros(1, 8, 64, dtype=torch.complex128), published_radar(channel_m=(0.0,)))
+    radar, data = published_radar(), torch.ones(3, 8, 64, dtype=torch.complex128)
+    with pytest.raises(ValueError, match=r"at least two positions in channel_m, got channel_m=\(0.0,\)"):
+        estimate_balance(data[:1], published_radar(channel_m=(0.0,)))
+    with pytest.raises(ValueError, match="bands must be at least 1, .* got 0"):
+        estimate_balance(data, radar, bands=0)
+    for blocks in (1, 54):
+        with pytest.raises(ValueError, match=f"blocks must be at least 2 and at most 53, .* got {blocks}"):
+            estimate_balance(data, radar, blocks=blocks)
     with pytest.raises(ValueError, match="each of the 3 positions"):
         estimate_balance(torch.zeros(2, 8, 64, dtype=torch.complex128), radar)
     with pytest.raises(ValueError, match="gain_db .* got shape \\(2,\\)"):

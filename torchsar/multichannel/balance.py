@@ -82,7 +82,8 @@ def correct_balance(
     refuse_other_count(
         "correct_balance", radar.channels, "channel", phase_rad=phase_rad, gain_db=gain_db, delay_s=delay_s
     )
-    factor = (unit_phasor(-phase_rad / (2 * math.pi), torch.complex128) * 10 ** (-gain_db / 20)).to(data.dtype)
+    turn = unit_phasor(-phase_rad.to(torch.float64) / (2 * math.pi), torch.complex128)
+    factor = (turn * 10 ** (-gain_db / 20)).to(data.dtype)
     delay_s = None if delay_s is None else delay_s[..., None]
     return without_errors(data, radar, factor[..., None], delay_s, with_range)
 
@@ -186,11 +187,17 @@ def estimate_balance(
     """
     data = checked_channels(data, radar, "estimate_balance", "channel, pulse, range")
     inside = int(data.shape[-1] * radar.pulse.bandwidth_hz / radar.sampling_hz)
-    if radar.channels < 2 or not (bands is None or bands >= 1) or not 2 <= blocks <= inside:
+    if radar.channels < 2:
         raise ValueError(
-            "the balance between channels needs at least two positions in channel_m, one of the Doppler bands, and 2 "
-            f"to {inside} blocks, the number of range frequencies of {data.shape[-1]} range samples within the "
-            f"bandwidth of the pulse, got channel_m={radar.channel_m}, bands={bands} and blocks={blocks}"
+            "estimate_balance compares the channels of a radar with at least two positions in channel_m, got "
+            f"channel_m={radar.channel_m}"
+        )
+    if not (bands is None or bands >= 1):
+        raise ValueError(f"bands must be at least 1, the number of Doppler bands with clutter, got {bands}")
+    if not 2 <= blocks <= inside:
+        raise ValueError(
+            f"blocks must be at least 2 and at most {inside}, the number of range frequencies of {data.shape[-1]} "
+            f"range samples within the bandwidth of the pulse, got {blocks}"
         )
     with torch.no_grad():
         lines, frequency = _band_lines(unit_level(data, 3), radar, blocks)

@@ -212,7 +212,7 @@ class ClutterModel:
 
         centre = torch.full(products.shape[:-3], 39.0, dtype=torch.float64, device=products.device)
         levels, _ = grid_minimum(cost, centre, 57.0, 20)
-        return parabola_minimum(cost, levels, 6.0, 0.4, rounds=3)[0]
+        return parabola_minimum(cost, levels, 2.0, 0.1, rounds=4)[0]
 
     def chance(self, snr_db: Tensor, reference: int, looks: float) -> Tensor:
         """Return by how much the powers of balanced channels differ from the reference by chance.
