@@ -5,6 +5,7 @@ precision, and requirements.
 from __future__ import annotations
 
 import functools
+import importlib
 import math
 from dataclasses import replace
 
@@ -12,6 +13,7 @@ import pytest
 import torch
 
 from tests.focus import helpers
+from tests.helpers import small_radar, small_recording
 from torchsar.focus import (
     OmegaK,
     StoredOmegaK,
@@ -22,6 +24,7 @@ from torchsar.focus import (
     requirements,
 )
 from torchsar.focus.requirements import Aperture
+from torchsar.focus.stored_omega_k import InvertibleOmegaK
 from torchsar.metrics import error_db
 
 CASES = {
@@ -167,3 +170,43 @@ def test_stored_filters_and_blocks_equal_the_plain_path():
     plain = omega_k(signal.data.clone().requires_grad_(), case.radar, **case.arguments).detach()
     assert error_db(stage(signal).data, plain) < -110
     assert error_db(stored, plain) < -110
+
+
+def test_stored_filters_have_the_names_of_earlier_saved_ones():
+    recording, _ = small_recording(16, 40)
+    names = StoredOmegaK(OmegaK(small_radar()), recording.signal.axes).state_dict()
+    assert list(names) == ["filter", "fine", "coarse"]
+
+
+@pytest.mark.parametrize("call", ["focus", "defocus"])
+def test_the_invertible_operator_refuses_what_is_no_matrix(call):
+    """A matrix without samples gave an error of the FFT library, a list one of an attribute."""
+    empty, x = torch.zeros(32, 0, dtype=torch.complex64), torch.ones(32, 8, dtype=torch.complex64)
+    transform = getattr(InvertibleOmegaK(small_radar(), x, doppler_hz=0.0), call)
+    for refuse, name in (
+        (lambda given: InvertibleOmegaK(small_radar(), given, doppler_hz=0.0), "InvertibleOmegaK"),
+        (transform, f"InvertibleOmegaK.{call}"),
+    ):
+        with pytest.raises(ValueError, match=rf"{name} works on samples .* got the shape \(32, 0\)"):
+            refuse(empty)
+        with pytest.raises(TypeError, match=f"{name} works on complex samples .* got list"):
+            refuse(x.tolist())
+
+
+def test_values_are_read_once_and_in_single_precision_only(monkeypatch):
+    """On an accelerator every reading waits for the device; 201 stands for a large shift."""
+    read = []
+
+    def large(x, otherwise):
+        read.append(x)
+        return 201.0
+
+    recording, _ = small_recording(16, 40, dtype=torch.complex128)
+    given = {"radar": small_radar(), "doppler_hz": 0.0}
+    plain = omega_k_stolt(recording.signal.data, **given)
+    for module in ("omega_k", "nufft"):
+        monkeypatch.setattr(importlib.import_module(f"torchsar.focus.{module}"), "host_largest", large)
+    torch.testing.assert_close(omega_k_stolt(recording.signal.data, **given), plain, rtol=0, atol=0)
+    assert not read
+    single = omega_k_stolt(recording.signal.data.to(torch.complex64), **given)
+    assert len(read) == 2 and error_db(single, plain) < -100, "one reading for the bulk filter, one for the shift"

@@ -59,8 +59,10 @@ class StoltMap:
         real = real_dtype(lines.dtype)
         # float32 serves for small shifts, which are the rule, and takes half the time; up to 200
         # grid points it keeps the error of the image below -80 dB
-        shift = self.basis.evaluate(residual, real if is_below(residual, 200) else torch.float64)
-        points = Points.of(self.plan.kernel, self.start, self.plan.length, real, shift)
+        near = real == torch.float64 or is_below(residual, 200)
+        shift = self.basis.evaluate(residual, real if near else torch.float64)
+        start, shift = (self.start, shift) if near else (self.start + shift, None)
+        points = Points.of(self.plan.kernel, start, self.plan.length, real, shift)
         return torch.fft.fftshift(torch.fft.ifft(self.plan.type2(lines, points)), dim=-1)
 
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis, Signal, Stage, outer_phasor, phasor_tables
+from torchsar.core import Axis, Signal, Stage, checked_samples, outer_phasor, phasor_tables
 from torchsar.focus.frame_geometry import FrameGeometry
 from torchsar.focus.omega_k import FrequencyBasis, OmegaK, bulk_filter, refocus_turns_per_sample, through_doppler
 from torchsar.radar import StripmapRadar
@@ -30,6 +30,15 @@ def all_pass(reference: Tensor) -> Tensor:
     """
     size = reference.abs()
     return torch.where(size > 0, reference / torch.where(size > 0, size, 1), 1)
+
+
+def _compressed(spectra: Tensor, bulk: Tensor, fine: Tensor, coarse: Tensor) -> Tensor:
+    """Transform Doppler rows (..., row, range frequency) into focused azimuth spectra.
+
+    The bulk filter has the shape of the rows. `fine` and `coarse` are the tables of the phasors of
+    refocusing, see `phasor_tables`.
+    """
+    return torch.fft.ifft(spectra * bulk) * outer_phasor(fine, coarse, spectra.shape[-1])
 
 
 class InvertibleOmegaK:
@@ -56,9 +65,11 @@ class InvertibleOmegaK:
         device: Device of the filters; None for that of the data.
 
     Raises:
-        ValueError: If `doppler_hz` or `velocity_m_s` is neither a number nor a tensor in the shape
-            of the leading dims of the data, the velocity is not positive, or the magnitude of
-            `doppler_hz` or `frame_hz` is not below 2 velocity / wavelength.
+        TypeError: If `like` is not complex64 or complex128.
+        ValueError: If `like` has no samples, or if `doppler_hz` or `velocity_m_s` is neither a
+            number nor a tensor in the shape of the leading dims of the data, the velocity is not
+            positive, or the magnitude of `doppler_hz` or `frame_hz` is not below 2 velocity /
+            wavelength.
     """
 
     def __init__(
@@ -73,6 +84,7 @@ class InvertibleOmegaK:
         band_hz: float | None = None,
         device: torch.device | None = None,
     ) -> None:
+        like = checked_samples(like, "InvertibleOmegaK", "pulse, range", finite=False)
         device = like.device if device is None else device
         at = FrameGeometry.of(radar, like, doppler_hz, velocity_m_s, frame_hz, device, band_hz)
         n, self.n = like.shape[-1], like.shape[-1]
@@ -92,9 +104,7 @@ class InvertibleOmegaK:
         Returns:
             Rows of focused azimuth spectra, shape (..., row, range).
         """
-        return torch.fft.ifft(spectra * self.bulk[..., rows, :]) * outer_phasor(
-            self.fine[..., rows, :], self.coarse[..., rows, :], self.n
-        )
+        return _compressed(spectra, *(table[..., rows, :] for table in (self.bulk, self.fine, self.coarse)))
 
     def expand(self, spectra: Tensor, rows: slice = slice(None)) -> Tensor:
         """Transform Doppler rows by the inverse of `compress`.
@@ -120,7 +130,12 @@ class InvertibleOmegaK:
 
         Returns:
             Image, same shape.
+
+        Raises:
+            TypeError: If the samples are not complex64 or complex128.
+            ValueError: If there are no samples.
         """
+        lines = checked_samples(lines, "InvertibleOmegaK.focus", "pulse, range", finite=False)
         return torch.fft.ifft(self.compress(torch.fft.fft2(lines)), dim=-2)
 
     def defocus(self, image: Tensor) -> Tensor:
@@ -133,7 +148,12 @@ class InvertibleOmegaK:
 
         Returns:
             Raw lines, same shape.
+
+        Raises:
+            TypeError: If the samples are not complex64 or complex128.
+            ValueError: If there are no samples.
         """
+        image = checked_samples(image, "InvertibleOmegaK.defocus", "azimuth, range", finite=False)
         return torch.fft.ifft2(self.expand(torch.fft.fft(image, dim=-2)))
 
 
@@ -157,7 +177,7 @@ class StoredOmegaK(Stage):
         dtype: Complex type of the data.
     """
 
-    bulk: Tensor
+    filter: Tensor
     fine: Tensor
     coarse: Tensor
 
@@ -176,8 +196,8 @@ class StoredOmegaK(Stage):
                 band_hz=stage.band_hz,
                 device=device,
             )
-        for name in ("bulk", "fine", "coarse"):
-            self.register_buffer(name, getattr(operator, name))
+        for name, table in (("filter", operator.bulk), ("fine", operator.fine), ("coarse", operator.coarse)):
+            self.register_buffer(name, table)
 
     def forward(self, signal: Signal) -> Signal:
         """Focus a recording whose axes and dtype are those that the filters were built for.
@@ -191,15 +211,14 @@ class StoredOmegaK(Stage):
         Raises:
             ValueError: If axes or dtype are not those that the filters were built for.
         """
-        if signal.axes != self.axes or signal.data.dtype != self.bulk.dtype:
+        if signal.axes != self.axes or signal.data.dtype != self.filter.dtype:
             raise ValueError(
-                f"the signal must have the axes {self.axes} and the dtype {self.bulk.dtype} that the filters of "
+                f"the signal must have the axes {self.axes} and the dtype {self.filter.dtype} that the filters of "
                 f"this StoredOmegaK were built for, got {signal.axes} and {signal.data.dtype}; build a new one"
             )
 
         def focus_rows(rows: Tensor, part: slice) -> Tensor:
-            lines = torch.fft.ifft(rows * self.bulk[..., part, :])
-            return lines * outer_phasor(self.fine[..., part, :], self.coarse[..., part, :], lines.shape[-1])
+            return _compressed(rows, *(table[..., part, :] for table in (self.filter, self.fine, self.coarse)))
 
         data = through_doppler(signal.data, focus_rows, differentiable=signal.data.requires_grad)
         return Signal(data, self.radar.image_axes(signal.axes))
