@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import importlib
 import math
+import pickle
 import warnings
 
 import pytest
@@ -281,6 +282,14 @@ def test_batch_equals_singles_and_broadcasts(transform):
     torch.testing.assert_close(
         torch.vmap(lambda k: matched_fourier(data[0], k, PRF))(K), matched_fourier(data[0], K, PRF)
     )
+
+
+@pytest.mark.parametrize("transform", [*sums(), Resampling("linear"), Resampling("spline")], ids=str)
+def test_a_pickled_operator_forms_the_same_image(transform):
+    operator, data = MatchedFourierOperator(K, N, PRF, dtype=torch.complex128, transform=transform), noise(2, N, 3)
+    sent, image = pickle.loads(pickle.dumps(operator)), operator.image(data)
+    torch.testing.assert_close(sent.image(data), image, rtol=0, atol=0)
+    torch.testing.assert_close(sent.adjoint(image), operator.adjoint(image), rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])

@@ -161,22 +161,27 @@ def explicit(of: PulsesToLines) -> Sum:
     Returns:
         The sum and its adjoint.
     """
-    points, lines = of.points, of.lines
+    points = of.points
     size = max(16, 32 * block_bytes_of(points.device) // (points.numel() * of.dtype.itemsize))
-    blocks = [(at, min(size, lines - at)) for at in range(0, lines, size)]
+    blocks = [(at, min(size, of.lines - at)) for at in range(0, of.lines, size)]
+    matrix = partial(_matrix, of, points)
+    return Sum(partial(_explicit, matrix, blocks), partial(_explicit_adjoint, matrix, blocks))
 
-    def matrix(at: int, count: int) -> Tensor:
-        """Matrix (..., pulse, line) of a block of lines."""
-        return of.scale * linear_phasor(points, at - lines // 2, count, of.dtype)
 
-    def forward(pulses: Tensor) -> Tensor:
-        return torch.cat([matrix(*block).mT @ pulses for block in blocks], -2)
+def _matrix(of: PulsesToLines, points: Tensor, at: int, count: int) -> Tensor:
+    """Matrix (..., pulse, line) of a block of `count` lines from line `at` on."""
+    return of.scale * linear_phasor(points, at - of.lines // 2, count, of.dtype)
 
-    def adjoint(image: Tensor) -> Tensor:
-        parts = [matrix(at, count).conj() @ image[..., at : at + count, :] for at, count in blocks]
-        return torch.stack(parts).sum(0)
 
-    return Sum(forward, adjoint)
+def _explicit(matrix: Callable[[int, int], Tensor], blocks: list[tuple[int, int]], pulses: Tensor) -> Tensor:
+    """Image lines (..., line, range) of pulses, block by block."""
+    return torch.cat([matrix(*block).mT @ pulses for block in blocks], -2)
+
+
+def _explicit_adjoint(matrix: Callable[[int, int], Tensor], blocks: list[tuple[int, int]], image: Tensor) -> Tensor:
+    """Pulses (..., pulse, range) of image lines, summed over the blocks."""
+    parts = [matrix(at, count).conj() @ image[..., at : at + count, :] for at, count in blocks]
+    return torch.stack(parts).sum(0)
 
 
 def resampled(of: PulsesToLines, interpolation: str) -> Sum:
@@ -193,29 +198,42 @@ def resampled(of: PulsesToLines, interpolation: str) -> Sum:
     Returns:
         The sum and its adjoint, by automatic differentiation of the linear map.
     """
-    step, lines, n_pulse = of.cells_per_line, of.lines, of.n_pulse
     interpolate = {"linear": _linear, "spline": _spline}[interpolation]
-    time = times_of_even_angle(of.warp_k, n_pulse, of.prf_hz)
-    duration = n_pulse / of.prf_hz
+    time = times_of_even_angle(of.warp_k, of.n_pulse, of.prf_hz)
+    duration = of.n_pulse / of.prf_hz
     rate = warp_rate(time, of.warp_k) * duration / whole_warp(of.warp_k, duration)
     position, factor = time * of.prf_hz, of.scale / rate
+    forward = partial(_resampled, of=of, interpolate=interpolate, position=position, factor=factor)
+    return Sum(forward, partial(_resampled_adjoint, forward=forward, shape=position.shape))
 
-    def forward(pulses: Tensor) -> Tensor:
-        even = interpolate(pulses, position) * factor.to(pulses.real.dtype)[..., None]
-        length = round(n_pulse / float(step)) if step.ndim == 0 and not step.requires_grad else 0
-        if length < lines or abs(length * float(step) - n_pulse) > 1e-9 * n_pulse:
-            per_pulse = step[..., None] / n_pulse
-            return chirp_z(even.mT, lines // 2 * per_pulse, -per_pulse, lines, centre=0).mT
-        return cropped(torch.fft.ifft(even.mT, length, norm="forward"), lines).mT
 
-    def adjoint(image: Tensor) -> Tensor:
-        trials = np.broadcast_shapes(image.shape[:-2], position.shape[:-1])
-        with torch.enable_grad():
-            pulses = image.new_zeros(*trials, n_pulse, image.shape[-1]).requires_grad_()
-            wanted = image.expand(*trials, *image.shape[-2:])
-            return torch.autograd.grad(forward(pulses), pulses, wanted, create_graph=image.requires_grad)[0]
+def _resampled(
+    pulses: Tensor,
+    of: PulsesToLines,
+    interpolate: Callable[[Tensor, Tensor], Tensor],
+    position: Tensor,
+    factor: Tensor,
+) -> Tensor:
+    """Image lines (..., line, range) of pulses, which are read at positions in pulses and weighted.
 
-    return Sum(forward, adjoint)
+    Positions and factors have the shape (..., pulse).
+    """
+    step, lines, n_pulse = of.cells_per_line, of.lines, of.n_pulse
+    even = interpolate(pulses, position) * factor.to(pulses.real.dtype)[..., None]
+    length = round(n_pulse / float(step)) if step.ndim == 0 and not step.requires_grad else 0
+    if length < lines or abs(length * float(step) - n_pulse) > 1e-9 * n_pulse:
+        per_pulse = step[..., None] / n_pulse
+        return chirp_z(even.mT, lines // 2 * per_pulse, -per_pulse, lines, centre=0).mT
+    return cropped(torch.fft.ifft(even.mT, length, norm="forward"), lines).mT
+
+
+def _resampled_adjoint(image: Tensor, forward: Callable[[Tensor], Tensor], shape: tuple[int, ...]) -> Tensor:
+    """Pulses (..., pulse, range) of image lines; `shape` is (..., pulse)."""
+    trials = np.broadcast_shapes(image.shape[:-2], shape[:-1])
+    with torch.enable_grad():
+        pulses = image.new_zeros(*trials, shape[-1], image.shape[-1]).requires_grad_()
+        wanted = image.expand(*trials, *image.shape[-2:])
+        return torch.autograd.grad(forward(pulses), pulses, wanted, create_graph=image.requires_grad)[0]
 
 
 def times_of_even_angle(k: Tensor, n_pulse: int, prf_hz: float) -> Tensor:
@@ -302,15 +320,16 @@ def compiled(of: PulsesToLines, eps: float) -> Sum:
         ModuleNotFoundError: If finufft is not installed.
     """
     _library()
-    points = of.points
-
-    def work(x: Tensor, lines: int) -> Tensor:
-        trials = np.broadcast_shapes(x.shape[:-2], points.shape[:-1])
-        double = x.expand(*trials, *x.shape[-2:]).to(torch.complex128)
-        made = _CompiledSum.apply(double, points.expand(*trials, points.shape[-1]), lines, eps)
-        return made.to(x.dtype) * of.scale
-
+    work = partial(_by_library, points=of.points, scale=of.scale, eps=eps)
     return Sum(partial(work, lines=of.lines), partial(work, lines=0))
+
+
+def _by_library(x: Tensor, points: Tensor, scale: float, eps: float, lines: int) -> Tensor:
+    """Image lines of pulses for lines > 0, otherwise pulses of image lines."""
+    trials = np.broadcast_shapes(x.shape[:-2], points.shape[:-1])
+    double = x.expand(*trials, *x.shape[-2:]).to(torch.complex128)
+    made = _CompiledSum.apply(double, points.expand(*trials, points.shape[-1]), lines, eps)
+    return made.to(x.dtype) * scale
 
 
 class _CompiledSum(torch.autograd.Function):
