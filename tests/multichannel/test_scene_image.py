@@ -74,6 +74,15 @@ def test_a_known_motion_is_kept() -> None:
         flow()(scenes()[0], known=9 * [known()])
 
 
+@pytest.mark.parametrize("range_m, u_a, lobe", [(4846.0, 5.13, True), (5153.9, -5.01, True), (4846.0, -5.13, False)])
+def test_side_lobes_have_the_doppler_rate_of_their_target(range_m: float, u_a: float, lobe: bool) -> None:
+    """Side lobes of one point without noise, with the first two motions, counted as targets."""
+    (ship,) = made().bodies
+    point = replace(ship, motion=known(), level=torch.tensor(4e5))
+    motion = PointMotion.imaged_at(RADAR, torch.zeros((), dtype=torch.float64), 8.0, u_a, known().image_s, range_m)
+    assert flow()._side_lobe(replace(ship, motion=motion, level=torch.tensor(150.0)), point) == lobe
+
+
 def test_zeroing_removes_the_sea_as_well() -> None:
     still, zero = StationaryImage(RADAR)(scenes()[1]), flow(removal="zero")(scenes()[0], known=[known()])
     shown = 300 * float(known().image_s)

@@ -265,7 +265,9 @@ class ImageMovers(Stage):
     def _side_lobe(self, body: Body, other: Body) -> bool:
         """Test whether a body may be range side lobes of another one, outside the removed lines.
 
-        It then has the same azimuth and nearly the same velocity as the other one.
+        It then has the same azimuth and nearly the same velocity as the other one. Side lobes have
+        the Doppler rate of their target, (v - u_a)^2 / R at the speed v, but at a range R of their
+        own, which changes the along-track speed that is found.
         """
         # A larger difference than 5 m/s rejects targets beside a ship, a smaller one accepts its
         # side lobes as targets. A body has many points, whose brightest ones exceed the mean level:
@@ -274,10 +276,12 @@ class ImageMovers(Stage):
             float((body.motion.range_m - other.motion.range_m).abs()),
             self.radar.wave_speed_m_s / self.radar.pulse.bandwidth_hz,
         )
-        off_m_s = (abs(float(getattr(body.motion, n) - getattr(other.motion, n))) for n in ("u_r_m_s", "u_a_m_s"))
+        along_m_s = other.motion.along_m_s * (body.motion.range_m / other.motion.range_m).sqrt()
+        off_m_s = (body.motion.u_r_m_s - other.motion.u_r_m_s, body.motion.along_m_s - along_m_s)
         off_m = abs(self._apparent_position(body).azimuth_m - self._apparent_position(other).azimuth_m)
         most = 20.0 * float(other.level) * (cell_m / (math.pi * max(away_m, cell_m))) ** 2
-        return max(off_m_s) < 5.0 and off_m < self.detector.apart_m[0] / 2 and float(body.level) < most
+        near = max(abs(float(off)) for off in off_m_s) < 5.0 and off_m < self.detector.apart_m[0] / 2
+        return near and float(body.level) < most
 
     def _apparent_position(self, body: Body) -> Detection:
         """Return where an image of the stationary scene shows a body."""
