@@ -70,8 +70,11 @@ def backproject_strip(
         reference: Spectrum of the range compression filter, shape (range,); None for
             range-compressed data.
         aperture: Function of slow time in seconds since that line of sight crossed the pixel, and
-            of the Doppler relative to the centroid in Hz, that returns the weights of the pulses;
-            None for all alike.
+            of the Doppler relative to the centroid in Hz, both float64 (..., pulse, pixel), that
+            returns the weights of the pulses in this shape; None for all alike. Common are
+            `lambda since_s, offset_hz: since_s.abs() <= T / 2` for an integration time T in
+            seconds, and `lambda since_s, offset_hz: offset_hz.abs() <= B / 2` for a Doppler band of
+            B Hz.
         start_s: Slow time of the first pulse in seconds.
         eps: Relative error of the interpolation in range.
         block_bytes: Size of a working array in bytes.
@@ -177,8 +180,11 @@ class Backproject(Focuser):
         cells: First range cell of the patch and the cell after its last; None for all cells.
         oversampling: Pixels per raw sample along either axis.
         aperture: Function of slow time in seconds since that line of sight crossed the pixel, and
-            of the Doppler relative to the centroid in Hz, that returns the weights of the pulses;
-            None for all alike.
+            of the Doppler relative to the centroid in Hz, both float64 (..., pulse, pixel), that
+            returns the weights of the pulses in this shape; None for all alike. Common are
+            `lambda since_s, offset_hz: since_s.abs() <= T / 2` for an integration time T in
+            seconds, and `lambda since_s, offset_hz: offset_hz.abs() <= B / 2` for a Doppler band of
+            B Hz.
         eps: Relative error of the interpolation in range.
 
     Raises:

@@ -107,7 +107,18 @@ class MultichannelUse:
         return max(abs(u) for u in self.u_r_m_s)
 
     def bandwidth_hz(self, radar: BistaticRadar, u_r_m_s: float = 0.0, u_a_m_s: float = 0.0) -> float:
-        """Return the processed Doppler bandwidth B_a = V^2 T / (lambda R0) in Hz."""
+        """Return the processed Doppler bandwidth B_a = V^2 T / (lambda R0).
+
+        V is the speed of the sensor relative to a target, and R0 the reference range.
+
+        Args:
+            radar: Radar parameters.
+            u_r_m_s: Slant-range speed of the target in m/s.
+            u_a_m_s: Along-track speed of the target in m/s, positive in the flight direction.
+
+        Returns:
+            Bandwidth in Hz.
+        """
         speed2 = (radar.speed_m_s - u_a_m_s) ** 2 + u_r_m_s**2
         return speed2 * self.integration_s / (radar.wavelength_m * radar.reference_range_m)
 

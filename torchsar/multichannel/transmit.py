@@ -146,10 +146,15 @@ class AzimuthScaling(ChannelStage):
     >>> from torchsar.core import Signal
     >>> from torchsar.multichannel import AzimuthScaling
     >>> from torchsar.radar import BistaticRadar, LinearFM
-    >>> radar = BistaticRadar(1.25e9, LinearFM(50e6, 10e-6), 60e6, 180.0, 300.0, 5000.0)
-    >>> signal = Signal(torch.ones(3, 90, dtype=torch.complex64), radar.axes(90))
-    >>> AzimuthScaling(radar)(signal).names
-    ('channel', 'pulse')
+    >>> radar = BistaticRadar(1.25e9, LinearFM(50e6, 10e-6), 60e6, 180.0, 300.0, 5000.0,
+    ...     transmit_range=(0.1, 0.5))  # 0.1 m/s and 0.5 m/s^2
+    >>> time_s = radar.pulse_axis(91).values()
+    >>> turns = -(0.1 * time_s + 0.5 * time_s**2) / radar.wavelength_m
+    >>> channels = Signal(torch.exp(2j * torch.pi * turns).expand(3, 91), radar.axes(91))
+    >>> channels.data[1, ::45].angle().round(decimals=2)  # first, middle and last pulse
+    tensor([-0.1600,  0.0000, -1.4700], dtype=torch.float64)
+    >>> AzimuthScaling(radar)(channels).data[1, ::45].angle().round(decimals=2)  # k1 t remains
+    tensor([ 0.6500,  0.0000, -0.6500], dtype=torch.float64)
 
     With the transmit range k1 t + k2 t^2 + ... over slow time t, data of channel m at the
     along-track position dx_m are multiplied by exp(j pi (q2 t'^2 + q3 t'^3 + q4 t'^4)), where t' =
