@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 from collections.abc import Callable, Sequence
 
@@ -187,3 +188,15 @@ def small_bistatic_echo(
         Draws(1, trials=None if trials is None else range(trials)),
         dtype=dtype,
     )[0].signal
+
+
+def radial_velocity_bound_m_s(radar: BistaticRadar, snr: float, n_seen: int, u_a_m_s: float = 0.0) -> float:
+    """Bound of the slant-range speed of a moving point from the phases between the channels.
+
+    It is v lambda / (2 pi sqrt(2 Ns snr sum (dx_m - mean dx)^2)) for the along-track speed v of the
+    receiver relative to the point and the positions dx_m of the channels; along-track speed,
+    position and amplitude are unknown.
+    """
+    along_m = radar.channels_at()
+    spread = float((along_m - along_m.mean()).square().sum())
+    return (radar.speed_m_s - u_a_m_s) * radar.wavelength_m / (2 * math.pi * math.sqrt(2 * n_seen * snr * spread))

@@ -187,7 +187,7 @@ def test_velocity_within_a_third_of_a_metre_per_second(off: float) -> None:
     assert bool(estimate.ok)
 
 
-def test_gradient_of_the_objective_is_the_slope_and_both_refinements_agree() -> None:
+def test_gradient_of_the_objective_is_the_slope() -> None:
     radar = kondor()
     recording, truth = strip(radar, 1536, 800)
     raw = recording.signal.data.to(torch.complex128)
@@ -199,10 +199,6 @@ def test_gradient_of_the_objective_is_the_slope_and_both_refinements_agree() -> 
     with torch.no_grad():
         numeric = (blocks(v + 0.01) - blocks(v - 0.01)).sum(-1) / 0.02
     torch.testing.assert_close(slope, numeric, rtol=1e-4, atol=1e-9)
-    signal = recording.signal.with_data(raw)
-    by_gradient = stage(signal, doppler_hz=truth)["velocity_m_s"]
-    by_parabola = EffectiveVelocity(OmegaK(radar), lines=128)(signal, doppler_hz=truth)["velocity_m_s"]
-    torch.testing.assert_close(by_gradient, by_parabola, atol=0.05, rtol=0)
 
 
 def test_a_batch_equals_single_trials_and_an_empty_trial_is_not_ok() -> None:

@@ -565,6 +565,10 @@ def test_a_start_connects_to_pga():
         (lambda x: pga(x, windows="narrow"), "windows must be 'shrinking', 'measured' or a list"),  # pyright: ignore
         (lambda x: pga_sca(x, windows=(9.0, 0.5)), "widths of 1 Doppler cell or more"),
         (lambda x: Pga(windows=[]), "widths of 1 Doppler cell or more"),
+        (lambda x: pga(x, windows=5), "list of widths of 1 Doppler cell or more, got 5"),  # pyright: ignore
+        (lambda x: pga(x, windows=["a"]), "list of widths of 1 Doppler cell or more, got"),  # pyright: ignore
+        (lambda x: pga(x, windows=torch.ones(3)), "list of widths of 1 Doppler cell or more, got"),  # pyright: ignore
+        (lambda x: PgaSca(windows=True), "list of widths of 1 Doppler cell or more, got True"),  # pyright: ignore
         (lambda x: entropy_fixed_point(x, floors=((0.0, 3),)), "pairs of a floor above 0"),
         (lambda x: entropy_fixed_point(x, relaxation=2.0), "relaxation must lie between 0 and 2"),
         (lambda x: EntropyFixedPoint(floors=[5.0], iterations=[3, 4]), "a number of iterations for each floor"),

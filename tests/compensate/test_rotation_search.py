@@ -317,6 +317,17 @@ def test_invalid_input_is_rejected() -> None:
         entropy_rotation(figure(data), "genetic", ([0.01, 9.0], [0.03, 11.0]), draws=Draws(1))
     with pytest.raises(ValueError, match="list of values for each of the 3 unknowns"):
         entropy_rotation(figure(data), "grid", [[0.02], [10.0]])
+    for method, where, form in (
+        ("grid", 0.02, "a list of values for each of the 3 unknowns"),
+        ("grid", [0.02, 10.0, 1000.0], "a list of values for each of the 3 unknowns"),
+        ("genetic", ([-1.0],), "two lists, the lower and the upper bounds, of the 3 unknowns"),
+        ("evolution", "narrow", "two lists, the lower and the upper bounds, of the 3 unknowns"),
+        ("newton", "near", "start must hold the 3 values omega_rad_s, k1_per_s, k2_per_s2"),
+    ):
+        with pytest.raises(ValueError, match=form):
+            entropy_rotation(figure(data), method, where)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="method 'genetic' needs random numbers; give draws"):
+        entropy_rotation(figure(data), "genetic", (0.9 * TRUTH, 1.1 * TRUTH))
     with pytest.raises(ValueError, match="27000 evaluations per trial, above the limit of 1000"):
         entropy_rotation(figure(data), "grid", [torch.linspace(1, 2, 30, dtype=F64)] * 3, limit=1000)
     with pytest.raises(ValueError, match="EntropyRotation needs a rotation to start from"):
@@ -325,6 +336,18 @@ def test_invalid_input_is_rejected() -> None:
         EntropyRotation(RADAR, "newton", start=[10.0, 1000.0])
     with pytest.raises(ValueError, match="low, high and counts must hold one entry per unknown"):
         EntropyRotation(RADAR, "grid", [0.0], [1.0, 2.0], [3])
+    with pytest.raises(ValueError, match="low, high and counts must hold one entry per unknown"):
+        EntropyRotation(RADAR, "grid", [], [], [])
+    with pytest.raises(ValueError, match="method must be one of grid, .*, got 'simplex'"):
+        EntropyRotation(RADAR, "simplex")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="method 'grid' needs low, high, counts; its options"):
+        EntropyRotation(RADAR, "grid")
+    with pytest.raises(ValueError, match="method 'genetic' needs high; its options"):
+        EntropyRotation(RADAR, "genetic", low=[0.0])
+    with pytest.raises(ValueError, match="method 'newton' does not take seed; its options are start, damped, steps"):
+        EntropyRotation(RADAR, "newton", seed=1)
+    with pytest.raises(ValueError, match="method 'evolution' needs low and does not take damped; its options"):
+        EntropyRotation(RADAR, "evolution", high=[1.0], damped=False)
 
 
 @pytest.mark.parametrize("order", [1, 2, 3, 4, 5])

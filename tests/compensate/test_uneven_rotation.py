@@ -306,6 +306,11 @@ def test_stages_provide_what_they_declare(stage) -> None:
     assert found["warp_k"].shape == (2, stage.order - 1) and torch.equal(found["warp_k"][:, 0], found["k1_per_s"])
 
 
+def test_the_third_option_of_a_coarse_rotation_is_the_assessment() -> None:
+    stage = CoarseRotation(RADAR, 3, False)
+    assert stage.yc_m is None and stage.options == {"fits": 0, "assess": False}
+
+
 def test_stages_equal_the_functions() -> None:
     data = target(0, yc_m=0.7)
     found = UnevenRotation(RADAR)(signal_of(data), yc_m=torch.tensor(0.7, dtype=F64))

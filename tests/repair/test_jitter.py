@@ -128,6 +128,20 @@ def test_a_pilot_without_jitter_gives_zero_offsets():
     assert bool(estimate.ok.all()) and float(estimate["offset_samples"].abs().max()) == 0
 
 
+@pytest.mark.parametrize(
+    "make, match",
+    [
+        (lambda: Lagrange("8"), "whole number of 2 to 64, such as 4, 8 or 12, got '8'"),  # pyright: ignore
+        (lambda: Lagrange(65), "whole number of 2 to 64, such as 4, 8 or 12, got 65"),
+        (lambda: BandLimited(8, "x"), "whole number of 2 to 64 points and a band .* band='x'"),  # pyright: ignore
+        (lambda: BandLimited(7.5), "whole number of 2 to 64 points and a band .* points=7.5"),  # pyright: ignore
+    ],
+)
+def test_interpolations_of_a_wrong_size_are_refused(make, match):
+    with pytest.raises(ValueError, match=match):
+        make()
+
+
 def test_invalid_pilots_raise_or_are_not_ok():
     good = PeriodicJitter(OFFSETS).pilot(OFFSETS, Draws(0, trials=range(5)), torch.zeros(1, dtype=torch.complex128))
     bad = good.clone()

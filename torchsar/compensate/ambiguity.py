@@ -303,7 +303,7 @@ class DopplerCentroid(Stage):
         joint = evidence["looks"] + evidence["lines"] + evidence["entropy"]
         best, nominal = turns[joint.argmax(-1)], radar.pointing_doppler_hz
         if nominal is not None:
-            sure = torch.softmax(joint, -1).amax(-1) > 0.9  # by choice, also in the assessment
+            sure = torch.softmax(joint, -1).amax(-1) > doppler_assess.LEAST_PROBABILITY
             best = torch.where(sure, best, torch.round((nominal - base) / prf))
         first = base + prf * best
         refined, std = complete_aperture_centroid(raw, radar, first, self.reference)

@@ -22,6 +22,8 @@ from torchsar.metrics.bounds import tone_frequency_bound_hz
 # Largest standard deviation of an estimate that is ok, in PRF. Noise alone has a predicted standard
 # deviation about ten times as large, since the sum of its products is no larger than their scatter.
 MOST_STD = 0.015
+# probability that the ambiguity of the PRF is right, above which it is taken as known, by choice
+LEAST_PROBABILITY = 0.9
 
 
 class Increments(NamedTuple):
@@ -60,7 +62,7 @@ class Increments(NamedTuple):
 
         Args:
             x: Lines, shape (..., pulse, range), complex.
-            products: Their products, see `torchsar.compensate.lag_products`.
+            products: Their products, see `torchsar.compensate.doppler.lag_products`.
             power: Their mean powers.
             prf_hz: Pulse repetition frequency in Hz.
             rate_hz_s: Magnitude of the Doppler rate of the targets in Hz/s. If it is None, targets
@@ -176,7 +178,7 @@ def absolute(
     outcome = worst(
         (Outcome.INEXACT, ~lines.coherent | inexact),
         (Outcome.MISFIT, shift >= lines.scale * lines.half_band_rad / 4),
-        (Outcome.AMBIGUOUS, probability <= 0.9),
+        (Outcome.AMBIGUOUS, probability <= LEAST_PROBABILITY),
         # incoherent lines with a third of the deviation of random frequencies, by choice
         (Outcome.NOISE, ~lines.coherent & (std >= 0.1 * unit)),
         (Outcome.EMPTY, plain.outcome == Outcome.EMPTY),

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import legendre, linear_phasor, linear_solve, unit_level, wrapped
+from torchsar.optim.scalar import vertex
 
 _HALF = 2  # samples per cell: |s|^2 has twice the band of s
 _QUARTER = 4  # samples per cell in correlations, whose other factor is not band-limited
@@ -141,8 +142,7 @@ class Envelopes:
         outside = wrapped(torch.arange(length, device=samples.device) / _QUARTER, self.n).abs() > within
         at = samples.masked_fill(outside, -torch.inf).argmax(-1, keepdim=True)
         left, top, right = (samples.gather(-1, (at + step) % length).to(torch.float64) for step in (-1, 0, 1))
-        bend = left - 2 * top + right
-        part = torch.where(bend < 0, 0.5 * (left - right) / torch.where(bend < 0, bend, -1), 0)
+        part = vertex(left, top, right)
         position = (at + torch.where(torch.isfinite(part), part, 0)).squeeze(-1)
         return torch.where(position > length / 2, position - length, position) / _QUARTER
 

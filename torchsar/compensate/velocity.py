@@ -37,7 +37,7 @@ from torchsar.core import (
     unit_level,
 )
 from torchsar.focus.omega_k import OmegaK
-from torchsar.optim.scalar import grid_minimum, parabola_minimum
+from torchsar.optim.scalar import grid_minimum, parabola_minimum, vertex
 from torchsar.radar import StripmapRadar
 
 
@@ -236,11 +236,10 @@ def _search(
         reach, share = 2 * step, min(1.0, 2 * share)
     step, best = 2 * reach / (count - 1), costs.argmin(-1)
     low, middle, high = (take(costs, (best + side).clamp(0, count - 1)) for side in (-1, 0, 1))
-    bend = low - 2 * middle + high
-    bent = (best > 0) & (best < count - 1) & (bend > 0)
-    vertex = torch.where(bent, value + 0.5 * step * (low - high) / torch.where(bent, bend, 1), value)
+    inner = (best > 0) & (best < count - 1)
+    value = torch.where(inner, value + step * vertex(-low, -middle, -high), value)
     best = first.argmin(-1)
-    return vertex, step / 4, (best > 0) & (best < first.shape[-1] - 1), first
+    return value, step / 4, (best > 0) & (best < first.shape[-1] - 1), first
 
 
 class EffectiveVelocity(Stage):

@@ -29,33 +29,6 @@ _INVOLVED = 1e-12
 Value = Tensor | float
 
 
-def radial_velocity_bound_m_s(radar: BistaticRadar, snr: Value, n_seen: Value, u_a_m_s: Value = 0.0) -> Tensor:
-    """Compute the bound of the slant-range speed of a moving point, in closed form.
-
-        v lambda / (2 pi sqrt(2 Ns snr sum (dx_m - mean dx)^2))
-
-    Here v is the along-track speed of the receiver relative to the point and dx_m the along-track
-    positions of the channels. Three channels a distance d apart give v lambda / (4 pi d sqrt(Ns
-    snr)). The along-track speed, the position and the complex amplitude of the point are unknown.
-    The formula uses only the phases between the channels; the curvature of the Doppler history,
-    which `bistatic_bounds` includes, adds almost no information.
-
-    Args:
-        radar: Radar with the positions of the channels along track.
-        snr: Power ratio of the point to the noise per sample.
-        n_seen: Number of pulses Ns in which the point is illuminated.
-        u_a_m_s: Along-track speed of the point in m/s.
-
-    Returns:
-        Standard deviation of the slant-range speed in m/s, float64; infinite for a single channel.
-    """
-    along_m = radar.channels_at()
-    spread = (along_m - along_m.mean()).square().sum()
-    speed = radar.speed_m_s - torch.as_tensor(u_a_m_s, dtype=torch.float64)
-    energy = nonnegative(n_seen) * nonnegative(snr)
-    return speed * radar.wavelength_m / (2 * math.pi * torch.sqrt(2 * energy * spread))
-
-
 def bistatic_bounds(
     radar: BistaticRadar,
     n_pulse: int,

@@ -85,7 +85,7 @@ def grid_search(
     if total > limit:
         raise ValueError(
             f"grid_search: {' x '.join(map(str, sizes))} values are {total} evaluations per "
-            f"trial, above the limit of {limit}; use fewer values, or raise `limit`"
+            f"trial, above the limit of {limit}; use fewer values"
         )
     _check_counts("grid_search", block=(block, 1))
     axes = [axis.expand(*shape, axis.shape[-1]) for axis in axes]

@@ -16,6 +16,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from numbers import Integral, Real
 
 import torch
 from torch import Tensor
@@ -255,15 +256,16 @@ class Lagrange:
         points: Number of neighbouring samples that are combined, 2 to 64; 4, 8 and 12 are usual.
 
     Raises:
-        ValueError: If the number of neighbours is outside 2..64.
+        ValueError: If the number of neighbours is not a whole number of 2 to 64.
     """
 
     points: int = 8
 
     def __post_init__(self) -> None:
-        if not 2 <= self.points <= 64:
+        if not (isinstance(self.points, Integral) and 2 <= self.points <= 64):
             raise ValueError(
-                f"points of Lagrange interpolation must be 2 to 64, got {self.points}; 4, 8 and 12 are usual"
+                "points of Lagrange interpolation must be a whole number of 2 to 64, such as 4, 8 or 12, "
+                f"got {self.points!r}"
             )
 
     def __call__(self, y: Tensor, offset_samples: Tensor) -> Tensor:
@@ -291,17 +293,19 @@ class BandLimited:
         band: Bandwidth of the signal over the sampling rate, above 0 and up to 1.
 
     Raises:
-        ValueError: If the number of neighbours or the band is outside its limits.
+        ValueError: If the number of neighbours is not a whole number, or it or the band is outside
+            its limits.
     """
 
     points: int = 8
     band: float = 0.95
 
     def __post_init__(self) -> None:
-        if not (2 <= self.points <= 64 and 0 < self.band <= 1):
+        whole, real = isinstance(self.points, Integral), isinstance(self.band, Real)
+        if not (whole and real and 2 <= self.points <= 64 and 0 < self.band <= 1):
             raise ValueError(
-                "band-limited interpolation needs points of 2 to 64 and a band (relative to the sampling rate) "
-                f"above 0 and up to 1, got points={self.points} and band={self.band}"
+                "band-limited interpolation needs a whole number of 2 to 64 points and a band (relative to the "
+                f"sampling rate) above 0 and up to 1, got points={self.points!r} and band={self.band!r}"
             )
 
     def __call__(self, y: Tensor, offset_samples: Tensor) -> Tensor:

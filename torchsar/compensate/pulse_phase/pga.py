@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from typing import Literal
 
 import torch
@@ -33,6 +34,7 @@ from torchsar.compensate.pulse_phase.data import (
 )
 from torchsar.compensate.pulse_phase.stages import _PhaseEstimator, _PhaseEstimatorFromStart
 from torchsar.core import Estimate, power_of, unit_phasor
+from torchsar.optim.scalar import vertex
 
 Kernel = Literal["lumv", "ml", "synchronised", "eigenvector"]
 Windows = Literal["shrinking", "measured"] | Sequence[float]
@@ -94,8 +96,8 @@ def pga(
     Raises:
         TypeError: If the data are not complex, or the start is not a tensor.
         ValueError: If the data are empty or not finite, the start does not have one phase per
-            pulse, the kernel or the windows are unknown, or a number of iterations is not a whole
-            number of 1 or more.
+            pulse, the kernel is unknown, the windows are neither of the two names nor a list of
+            widths of 1 cell or more, or a number of iterations is not a whole number of 1 or more.
 
     Reference:
         Kernels: Eichel and Jakowatz 1989 ("lumv"); Jakowatz and Wahl 1993 ("ml", "eigenvector").
@@ -145,8 +147,8 @@ def pga_sca(
 
     Raises:
         TypeError: If the data are not complex.
-        ValueError: If the data are empty or not finite, the kernel or the windows are unknown, or a
-            number of iterations is not a whole number of 1 or more.
+        ValueError: If the data are empty or not finite, the kernel or the windows are not valid as
+            in `pga`, or a number of iterations is not a whole number of 1 or more.
 
     Reference:
         Ruan et al. 2013, Eqs. (11)-(16).
@@ -282,16 +284,19 @@ class _Search:
     patience: int
 
     def __post_init__(self) -> None:
-        refuse_odd_counts("pga", 1, iterations=self.iterations, patience=self.patience)
-        if self.kernel not in _KERNELS:
-            raise ValueError(f"PGA kernel {self.kernel!r} is not known; choose one of {', '.join(_KERNELS)}")
-        if self.windows in ("shrinking", "measured"):
-            return
-        if isinstance(self.windows, str) or not self.windows or not all(1 <= w < math.inf for w in self.windows):
+        widths = self.windows if isinstance(self.windows, Sequence) else ()
+        if not widths or not (
+            widths in ("shrinking", "measured")
+            if isinstance(widths, str)
+            else all(isinstance(w, Real) and 1 <= w < math.inf for w in widths)
+        ):
             raise ValueError(
                 "pga: windows must be 'shrinking', 'measured' or a list of widths of 1 Doppler cell or more, "
                 f"got {self.windows!r}"
             )
+        refuse_odd_counts("pga", 1, iterations=self.iterations, patience=self.patience)
+        if self.kernel not in _KERNELS:
+            raise ValueError(f"PGA kernel {self.kernel!r} is not known; choose one of {', '.join(_KERNELS)}")
 
     def __call__(self, rows: Tensor, present: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
         best, lowest = phase, torch.full_like(phase[:, 0], torch.inf)
@@ -411,9 +416,7 @@ class View:
         low, top, high = (
             self.power.gather(-1, torch.remainder(self.peak[..., None] + d, padded))[..., 0].sqrt() for d in (-1, 0, 1)
         )
-        bend = low - 2 * top + high  # of a parabola through three amplitudes
-        offset = torch.where(bend < 0, 0.5 * (low - high) / torch.where(bend < 0, bend, -1), 0).clamp(-0.5, 0.5)
-        turns = -(offset / padded)[..., None].double() * k
+        turns = -(vertex(low, top, high).clamp(-0.5, 0.5) / padded)[..., None].double() * k
         return g * unit_phasor(turns, g.dtype) * self.present[:, None, :]
 
 

@@ -278,9 +278,10 @@ class Autofocus(_PhaseEstimatorFromStart):
         polish: Largest number of further iterations, which compare each pulse with a Wiener
             estimate of the scene.
         imaging: Image formation whose image is sharpened; by default a Fourier transform along
-            pulses. A `TargetImage` gives the polar-format image of a target in known geometry.
-        scene: Kind of the scene: "sparse", "points", "clutter" or "auto", see `autofocus`; with an
-            image formation it is taken to be sparse.
+            pulses. A `TargetImage` with a geometry gives the polar-format image of the target, one
+            without a geometry the Fourier transform.
+        scene: Kind of the scene: "sparse", "points", "clutter" or "auto", see `autofocus`. With an
+            image formation other than the Fourier transform it is taken to be sparse.
         assess: Whether to add the standard deviation and the outcome.
     """
 

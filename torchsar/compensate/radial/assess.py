@@ -84,8 +84,7 @@ def _variance(measured: Measured, pulse: Axis) -> Tensor:
         counted = count * mean_of(changes.square() * share, clear) + 4 * white
         return counted / ((count - 1).clamp_min(0) + 4)
 
-    of_product = _changes_of_product(measured, law.intercept or "free")
-    changes = of_product if law.changes is None else law.changes()
+    changes = _changes_of_product(measured, law.intercept or "free") if law.changes is None else law.changes()
     square = filled(variance(changes) / share, clear)
     slope, bend = (_rms_difference(measured.raw_m_s, clear, order) for order in (1, 2))
     # 1 / 32: mean square of the time between two samples of a product over 24 squared periods
@@ -96,6 +95,7 @@ def _variance(measured: Measured, pulse: Axis) -> Tensor:
     away = measured.velocity_m_s - mirror_velocity(measured.product, "free")[0]
     # that the edges of the window leave
     bias = 5e-4 * measured.product.radar.ambiguous_velocity_m_s
+    of_product = changes if law.changes is None else _changes_of_product(measured, "free")
     apart = mean_of(away.square() - variance(of_product) / share, clear) - bias**2
     judged = (measured.levels.squared >= LEAST_SQUARED)[..., None]
     return torch.where(judged, torch.maximum(square, apart), square)

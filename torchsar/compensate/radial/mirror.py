@@ -57,7 +57,7 @@ def mirror_product(
             it as zero; this requires accurate trigger timing and lowers the variance by a factor of
             four. "free" assumes nothing and uses only the slope of the phase. "record" estimates
             one constant phase for the whole record, for an unknown but constant timing error.
-        taper: Share of the window that its edges take, see `bands_of`.
+        taper: Share of the window that its edges take, see `Spectra.bands`.
         azimuth_m: Azimuth of the scene centre in metres, a number or shape (...,). The radial
             velocity that the straight flight causes there is subtracted, see
             `geometric_velocity_m_s`.

@@ -79,7 +79,7 @@ def radial_motion(
             whole band.
         intercept: What is assumed of the phase of the product of up and mirrored down sweep at the
             turning point: "known", "record" or "free", see `mirror_product`.
-        taper: Share of the window that its edges take, see `bands_of`.
+        taper: Share of the window that its edges take, see `Spectra.bands`.
         azimuth_m: Azimuth of the scene centre in metres, a number or shape (...,).
         iterations: Largest number of iterations, see `phase_polish`.
         tolerance_rad: Tolerance of the iterations in rad, see `phase_polish`.

@@ -105,7 +105,7 @@ def entropy_rotation(
 
     Raises:
         ValueError: If the method is none of these, there is not one list of values, one bound or
-            one start value per unknown, or an option is invalid.
+            one start value per unknown, `draws` is missing, or an option is invalid.
 
     Reference:
         Remote Sens. 2025, 17, 3447, section 3.3 and Table 2.
@@ -115,21 +115,27 @@ def entropy_rotation(
     if method in ("newton", "descent"):
         return _from_start(figure, method, where, assess, **options)
     names = figure.unknowns.names
+    try:
+        axes = [torch.as_tensor(part, dtype=torch.float64, device=figure.range_m.device) for part in where]
+    except (TypeError, ValueError, RuntimeError):
+        axes = []
+    if len(axes) != (len(names) if method == "grid" else 2) or not all(axis.ndim for axis in axes):
+        form = "a list of values for each" if method == "grid" else "two lists, the lower and the upper bounds,"
+        raise ValueError(
+            f"entropy_rotation: where must hold {form} of the {len(names)} unknowns {', '.join(names)} for method "
+            f"{method!r}, got {where!r:.200}"
+        )
     if method == "grid":
-        if len(where) != len(names):
-            raise ValueError(
-                f"entropy_rotation: a grid needs a list of values for each of the {len(names)} unknowns "
-                f"{', '.join(names)}, got {len(where)} lists"
-            )
-        axes = [torch.as_tensor(axis, dtype=torch.float64, device=figure.range_m.device) for axis in where]
         found = grid_search(figure, axes, trials=figure.trials, **options)
         low, high = (
             torch.stack([end(axis, -1).expand(figure.trials) for axis in axes], -1) for end in (torch.amin, torch.amax)
         )
     else:
         low, high = (
-            figure.spread(figure.unknowns.vector(x, what)) for x, what in zip(where, ("low", "high"), strict=True)
+            figure.spread(figure.unknowns.vector(x, what)) for x, what in zip(axes, ("low", "high"), strict=True)
         )
+        if not isinstance(options.get("draws"), Draws):
+            raise ValueError(f"entropy_rotation: method {method!r} needs random numbers; give draws=Draws(seed)")
         found = (genetic if method == "genetic" else differential_evolution)(figure, low, high, **options)
     width = high - low
     # a minimum so near the edge is taken to lie outside, a convention
@@ -265,13 +271,14 @@ class EntropyRotation(Stage):
             "steps": steps,
         }
         given = {name: value for name, value in given.items() if value is not None}
-        takes = _OPTIONS.get(method, ())
+        if method not in tuple(_OPTIONS):
+            raise ValueError(f"EntropyRotation: method must be one of {', '.join(_OPTIONS)}, got {method!r}")
+        takes = _OPTIONS[method]
         missing = [name for name in takes if name in ("low", "high", "counts") and name not in given]
-        if not takes or missing or not given.keys() <= set(takes):
-            raise ValueError(
-                f"method must be one of {', '.join(_OPTIONS)}, with its own options ({method!r}: "
-                f"{', '.join(takes) or 'none'}; low, high and counts are required), got {', '.join(given) or 'none'}"
-            )
+        faults = {"needs": missing, "does not take": [name for name in given if name not in takes]}
+        if any(faults.values()):
+            said = " and ".join(f"{verb} {', '.join(some)}" for verb, some in faults.items() if some)
+            raise ValueError(f"EntropyRotation: method {method!r} {said}; its options are {', '.join(takes)}")
         if objective is None:
             objective = EntropyObjective(
                 taps=6 if method == "newton" else 4, variables="shape" if method == "descent" else "raw"
@@ -280,7 +287,7 @@ class EntropyRotation(Stage):
         self.method: Method = method
         ends = [given.pop(name) for name in ("low", "high", "counts") if name in given]
         if counts is not None:
-            if len({len(end) for end in ends}) > 1 or min(counts) < 1:
+            if len({len(end) for end in ends}) > 1 or min(counts, default=0) < 1:
                 raise ValueError(
                     "low, high and counts must hold one entry per unknown, with counts of 1 or more, got "
                     f"low {low}, high {high} and counts {counts}"

@@ -194,9 +194,14 @@ class Unknowns:
             The vector, shape (..., n), float64.
 
         Raises:
-            ValueError: If there is not one value per unknown.
+            ValueError: If there is not one number per unknown.
         """
-        x = torch.as_tensor(values, dtype=torch.float64)
+        try:
+            x = torch.as_tensor(values, dtype=torch.float64)
+        except (TypeError, ValueError, RuntimeError):
+            raise ValueError(
+                f"{what} must hold the {len(self.names)} values {', '.join(self.names)}, got {values!r:.200}"
+            ) from None
         if x.ndim == 0 or x.shape[-1] != len(self.names):
             raise ValueError(
                 f"{what} must hold the {len(self.names)} values {', '.join(self.names)}, got "

@@ -161,7 +161,7 @@ def coarse_rotation(
     fits: int = 0,
     assess: bool = True,
 ) -> Estimate:
-    """Estimate k1 and k2 from the spectra of short sections, the first step of `uneven_rotation`.
+    """Estimate k1 and k2 from the spectra of short sections, and with `fits` also the rate.
 
     >>> import torch
     >>> from torchsar.compensate import coarse_rotation
@@ -171,11 +171,12 @@ def coarse_rotation(
     >>> found["warp_k"].shape, found["k1_per_s"].shape
     (torch.Size([2]), torch.Size([]))
 
-    The ratio of the rotation rate at time t after the first pulse to that at the first pulse is
-    modelled as 1 + k1 t + k2 t^2 / 2 and is found to a few thousandths. The rotation rate itself is
-    not estimated; `omega_rad_s` is 0. With `fits`, least squares on the phase histories of bright
-    scatterers follow, the second step of `uneven_rotation`, which also find the rate. Four fits
-    take half the time of `uneven_rotation`; the errors are two to twenty times as large.
+    This is the first step of `uneven_rotation`. The ratio of the rotation rate at time t after the
+    first pulse to that at the first pulse is modelled as 1 + k1 t + k2 t^2 / 2 and is found to a
+    few thousandths. Without `fits` the rotation rate itself is not estimated; `omega_rad_s` is 0.
+    With `fits`, least squares on the phase histories of bright scatterers follow, the second step
+    of `uneven_rotation`, which also find the rate. Four fits take half the time of
+    `uneven_rotation`; the errors are two to twenty times as large.
 
     Args:
         data: Range-compressed pulses, shape (..., pulse, range), complex, at least 8 pulses.
@@ -185,7 +186,8 @@ def coarse_rotation(
         order: Degree of the polynomial of time that describes the rotation angle. 1 is uniform
             rotation; with 2 only k1 is returned, and beyond 3 the further derivatives are 0.
         yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
-            rotation centre), if known a priori, a number or shape (...,).
+            rotation centre), if known a priori, a number or shape (...,). None estimates it where
+            `fits` is above 0, and takes it as 0 otherwise.
         fits: Number of times that the least-squares fit to the phase histories is made.
         assess: False leaves out the assessment.
 
@@ -200,8 +202,8 @@ def coarse_rotation(
 
     Raises:
         TypeError: If the data are not complex.
-        ValueError: If the data, the range axis or `yc_m` are invalid, or the order is not a whole
-            number of 1 or more.
+        ValueError: If the data, the range axis or `yc_m` are invalid, the order is not a whole
+            number of 1 or more, or `fits` is not a whole number of 0 or more.
     """
     refuse_odd_counts("coarse_rotation", 1, order=order)
     refuse_odd_counts("coarse_rotation", 0, fits=fits)
@@ -354,7 +356,7 @@ class UnevenRotation(_Rotation):
 
 
 class CoarseRotation(_Rotation):
-    """Relative derivatives k1 and k2 of the rotation rate; see `coarse_rotation`.
+    """Derivatives k1 and k2 of the rotation rate, with `fits` also the rate; see `coarse_rotation`.
 
     They are found from the Doppler spectra of short sections of the aperture.
 
@@ -362,18 +364,18 @@ class CoarseRotation(_Rotation):
         radar: Radar parameters.
         order: Degree of the polynomial of time that describes the rotation angle; 1 is uniform
             rotation.
+        assess: False leaves out the assessment.
         yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
-            rotation centre), if known a priori.
+            rotation centre), if known a priori; None estimates it where `fits` is above 0.
         fits: Number of least-squares fits to the phase histories of bright scatterers, which also
             find the rotation rate.
-        assess: False leaves out the assessment.
 
     Raises:
         ValueError: If the order is below 1.
     """
 
     def __init__(
-        self, radar: InverseRadar, order: int = 3, yc_m: float | None = None, fits: int = 0, assess: bool = True
+        self, radar: InverseRadar, order: int = 3, assess: bool = True, yc_m: float | None = None, fits: int = 0
     ) -> None:
         super().__init__(radar, order, yc_m, coarse_rotation, fits=fits, assess=assess)
 
