@@ -545,6 +545,13 @@ CASES = [
     ),
     Case("focus_azimuth", lambda: multichannel.FocusAzimuth(BISTATIC, bandwidth_hz=300.0), _motion, channels="doppler"),
     Case(
+        "focus_plan",
+        lambda: multichannel.FocusPlan(BISTATIC, bandwidth_hz=300.0, u_r_m_s=5.0, u_a_m_s=2.0),
+        vmap=False,
+        channels="line",
+        laws=Laws(pulse=NEW_AXIS),
+    ),
+    Case(
         "stationary_image",
         lambda: multichannel.StationaryImage(BISTATIC, form="bulk"),
         vmap=False,

@@ -29,7 +29,7 @@ full Doppler band of a point       `reconstruct` with `LeastSquares` or `Minimum
 expected power over Doppler        `FlatBand`, `ElementPattern`
 quality of a reconstruction        `condition_number`, `noise_gain_db`; `doppler_offsets` of its
                                    bins
-azimuth image of a point           `focus_azimuth`
+azimuth image of a point           `focus_azimuth`; for one known motion `FocusPlan`
 =================================  =================================================================
 
 Most functions are stages of chains, too: `Reconstruct` calls `reconstruct`, and so on.
@@ -52,6 +52,7 @@ from torchsar.multichannel.migration import (
     correct_migration,
 )
 from torchsar.multichannel.motion import PointMotion
+from torchsar.multichannel.plan import FocusPlan
 from torchsar.multichannel.reconstruct import (
     LeastSquares,
     MinimumMeanSquare,
@@ -100,6 +101,7 @@ __all__ = [
     "Extraction",
     "FlatBand",
     "FocusAzimuth",
+    "FocusPlan",
     "Frame",
     "GradientVelocity",
     "ImageMovers",
