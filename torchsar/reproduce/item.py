@@ -1,4 +1,4 @@
-"""Numbered figures and tables of papers, what is compared of each, and the verdict."""
+"""Figures, tables and numbers in the text of papers, what is compared of each, and the verdict."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from typing import Any
 
 import torch
 
-REPRODUCED, BETTER, NOT_REPRODUCED = "reproduced", "better", "not reproduced"
-KINDS = ("figure", "table", "diagram", "photograph")
-# kinds that show nothing that can be computed
-SHOWN = ("diagram", "photograph")
+REPRODUCED, BETTER, NOT_REPRODUCED, MISPRINT = "reproduced", "better", "not reproduced", "error of the paper"
+KINDS = ("figure", "table", "text", "erratum", "diagram", "photograph", "unpublished")
+# kinds with nothing that can be compared: they show nothing that can be computed, or what they show
+# is of a recording or a model that is not published
+SHOWN = ("diagram", "photograph", "unpublished")
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,9 @@ class Check:
             and of statements.
         tolerance: Largest difference that counts as reproduced (see `verdict`); None for
             statements.
-        verdict: `REPRODUCED`, `BETTER` or `NOT_REPRODUCED`.
+        verdict: `REPRODUCED`, `BETTER`, `NOT_REPRODUCED` or `MISPRINT`.
+        draws: Number of random draws behind our number; 0 without random numbers, None of
+            statements.
     """
 
     name: str
@@ -38,6 +41,29 @@ class Check:
     std: float | None
     tolerance: float | None
     verdict: str
+    draws: int | None = None
+
+
+@dataclass(frozen=True)
+class Fact:
+    """One of the numbers on which the reason of what is not reproduced rests.
+
+    Args:
+        name: Name by which the words of the reason refer to the number.
+        value: The number.
+        least: Least value with which the reason holds.
+        most: Largest value with which it holds.
+    """
+
+    name: str
+    value: float
+    least: float = -math.inf
+    most: float = math.inf
+
+    @property
+    def holds(self) -> bool:
+        """Whether the reason holds with this number."""
+        return self.least <= self.value <= self.most
 
 
 def verdict(published: float, ours: float, std: float, tolerance: float, better: str = "") -> str:
@@ -79,11 +105,12 @@ def number(
         The comparison.
     """
     spread: float | None = std
+    count = 1 if std else 0
     if isinstance(ours, Sequence):
-        draws = torch.tensor([float(x) for x in ours], dtype=torch.float64)
-        ours, spread = float(draws.mean()), float(draws.std() / math.sqrt(len(draws))) if len(draws) > 1 else None
+        draws, count = torch.tensor([float(x) for x in ours], dtype=torch.float64), len(ours)
+        ours, spread = float(draws.mean()), float(draws.std() / math.sqrt(count)) if count > 1 else None
     found = verdict(published, float(ours), spread or 0.0, tolerance, better)
-    return Check(name, float(published), float(ours), spread, float(tolerance), found)
+    return Check(name, float(published), float(ours), spread, float(tolerance), found, count)
 
 
 def parameters(rows: Mapping[str, tuple[float, float]], share: float) -> list[Check]:
@@ -99,7 +126,7 @@ def parameters(rows: Mapping[str, tuple[float, float]], share: float) -> list[Ch
     return [number(name, published, ours, share * abs(published)) for name, (published, ours) in rows.items()]
 
 
-def statement(name: str, published: str, holds: bool, ours: str) -> Check:
+def statement(name: str, published: str, holds: bool, ours: str, draws: int | None = None) -> Check:
     """Compare what a paper states in words or shows in a picture without numbers.
 
     Args:
@@ -107,51 +134,77 @@ def statement(name: str, published: str, holds: bool, ours: str) -> Check:
         published: What the paper states, in our words.
         holds: Whether our result says the same.
         ours: The numbers that show it.
+        draws: Number of random draws behind them.
 
     Returns:
         The comparison.
     """
-    return Check(name, published, ours, None, None, REPRODUCED if holds else NOT_REPRODUCED)
+    return Check(name, published, ours, None, None, REPRODUCED if holds else NOT_REPRODUCED, draws)
 
 
-def falling(name: str, values: dict[str, float], rising: bool = False) -> Check:
+def misprint(name: str, published: str, shown: bool, ours: str) -> Check:
+    """List what a paper has wrong, or what contradicts another number of the same paper.
+
+    Args:
+        name: What it is about.
+        published: What the paper has.
+        shown: Whether our numbers show that it is wrong.
+        ours: These numbers.
+
+    Returns:
+        The comparison, `MISPRINT` if it is shown.
+    """
+    return Check(name, published, ours, None, None, MISPRINT if shown else NOT_REPRODUCED)
+
+
+def falling(name: str, values: Mapping[str, float | Sequence[float]], rising: bool = False) -> Check:
     """Compare the order of methods, where the published numbers depend on what is not published.
 
     Args:
         name: What is compared, with its unit.
-        values: Our number by method, in the order in which the published numbers fall.
+        values: Our number by method, or one number per random draw, whose mean is compared, in the
+            order in which the published numbers fall.
         rising: Whether the published numbers rise instead.
 
     Returns:
         The comparison.
     """
-    ours = list(values.values())
+    rows = {method: value if isinstance(value, Sequence) else [value] for method, value in values.items()}
+    ours = [sum(row) / len(row) for row in rows.values()]
     holds = ours == sorted(ours, reverse=not rising)
-    listed = "; ".join(f"{method} {value:.4g}" for method, value in values.items())
-    return statement(name, f"{'rises' if rising else 'falls'} in the order: {'; '.join(values)}", holds, listed)
+    listed = "; ".join(f"{method} {value:.4g}" for method, value in zip(rows, ours, strict=True))
+    draws = max(map(len, rows.values()))
+    return statement(name, f"{'rises' if rising else 'falls'} in the order: {'; '.join(values)}", holds, listed, draws)
+
+
+Made = Sequence[Check | Fact]
 
 
 @dataclass(frozen=True)
 class Item:
-    """A numbered figure or table of a paper.
+    """A numbered figure or table of a paper, a number in its text, or something it has wrong.
 
     Args:
-        label: Its number, such as "Figure 5".
+        label: Its number, such as "Figure 5"; "Text 1" and "Erratum 1" are numbers of our own.
         subject: What it shows, in our words.
-        kind: One of `KINDS`.
         of: Experiment that it is made of, a function of whether the reduced form is wanted; items
             with the same one share its result.
         make: Function of the result of the experiment and the path of a picture, which draws the
-            picture and returns what is compared; None where nothing can be made.
-        why: Reason of what is not reproduced.
+            picture and returns what is compared, and the facts of `why`; None where nothing can be
+            made.
+        why: Reason of what is not reproduced, with the names of facts in braces.
+        kind: One of `KINDS`; by default the word of the label.
     """
 
     label: str
     subject: str
-    kind: str = "figure"
     of: Callable[[bool], Any] | None = None
-    make: Callable[[Any, Path], Sequence[Check]] | None = None
+    make: Callable[[Any, Path], Made] | None = None
     why: str = ""
+    kind: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "kind", self.kind or self.label.split()[0].lower())
 
     @property
     def file(self) -> str:
@@ -159,15 +212,44 @@ class Item:
         word, number = self.label.split()
         return f"{word.lower()}_{int(number):02}.png"
 
+    def reason(self, facts: Sequence[Fact]) -> str:
+        """Say why the item is not reproduced.
+
+        Args:
+            facts: Numbers of the reason.
+
+        Returns:
+            The words with the numbers, or which of the facts does not hold.
+        """
+        failed = [fact for fact in facts if not fact.holds]
+        if failed:
+            numbers = ", ".join(f"{one.name} {one.value:.4g} in {one.least:g} to {one.most:g}" for one in failed)
+            return f"the reason that the full form has does not hold here: it expects {numbers}"
+        return self.why.format_map({fact.name: fact.value for fact in facts})
+
+
+def given(label: str, subject: str, *found: Check | Fact) -> Item:
+    """Make an item of comparisons that need no experiment.
+
+    Args:
+        label: Its number.
+        subject: What it is about, in our words.
+        *found: What is compared.
+
+    Returns:
+        The item.
+    """
+    return Item(label, subject, bool, lambda _small, _path: found)
+
 
 @dataclass(frozen=True)
 class Paper:
-    """A paper and all its numbered figures and tables.
+    """A paper with all its numbered figures and tables, and numbers of its text.
 
     Args:
         name: System that follows the paper.
         source: Where it appeared.
-        items: Figures and tables, in the order of their numbers.
+        items: What is compared, in the order of `in_order`.
     """
 
     name: str
@@ -178,7 +260,7 @@ class Paper:
         """Return the item of a number.
 
         Args:
-            label: Such as "Table 2", "table2" or "fig. 5".
+            label: Such as "Table 2", "table2", "fig. 5" or "text 1".
 
         Returns:
             The item.
@@ -186,12 +268,13 @@ class Paper:
         Raises:
             ValueError: If the paper has no such item.
         """
-        found = re.fullmatch(r"\s*(fig|figure|tab|table)[\s._-]*0*(\d+)\s*", label, re.IGNORECASE)
-        wanted = f"{'Figure' if found[1].lower().startswith('fig') else 'Table'} {found[2]}" if found else ""
+        words = {"fig": "Figure", "tab": "Table", "tex": "Text", "err": "Erratum"}
+        found = re.fullmatch(r"\s*(fig|figure|tab|table|text|err|erratum)[\s._-]*0*(\d+)\s*", label, re.IGNORECASE)
+        wanted = f"{words[found[1][:3].lower()]} {found[2]}" if found else ""
         item = next((one for one in self.items if one.label == wanted), None)
         if item is None:
-            counts = {word: sum(one.label.startswith(word) for one in self.items) for word in ("Figure", "Table")}
-            known = " and ".join(f"{word.lower()}1 to {word.lower()}{n}" for word, n in counts.items() if n)
+            counts = {word: sum(one.label.startswith(word) for one in self.items) for word in words.values()}
+            known = ", ".join(f"{word.lower()}1 to {word.lower()}{n}" for word, n in counts.items() if n)
             raise ValueError(f"the paper of {self.name} has no {label!r}; it has {known}")
         return item
 
@@ -204,19 +287,17 @@ def settled(item: Item, checks: Sequence[Check]) -> str:
         checks: What was compared of it.
 
     Returns:
-        The kind of what shows nothing that can be computed; otherwise the worst verdict of the
-        comparisons, where `BETTER` counts if nothing is `NOT_REPRODUCED`.
+        The kind of what has nothing that can be compared; otherwise the first verdict of
+        `NOT_REPRODUCED`, `MISPRINT`, `BETTER` and `REPRODUCED` that one of the comparisons has.
     """
     if item.kind in SHOWN:
         return item.kind
-    verdicts = {check.verdict for check in checks}
-    if not checks or NOT_REPRODUCED in verdicts:
-        return NOT_REPRODUCED
-    return BETTER if BETTER in verdicts else REPRODUCED
+    verdicts = {check.verdict for check in checks} or {NOT_REPRODUCED}
+    return next(one for one in (NOT_REPRODUCED, MISPRINT, BETTER, REPRODUCED) if one in verdicts)
 
 
 def in_order(*items: Item) -> tuple[Item, ...]:
-    """Sort figures and tables by their numbers, the figures first.
+    """Sort items by their numbers: figures, tables, numbers of the text, errors of the paper.
 
     Args:
         items: The items, in any order.
@@ -224,4 +305,5 @@ def in_order(*items: Item) -> tuple[Item, ...]:
     Returns:
         The same, sorted.
     """
-    return tuple(sorted(items, key=lambda one: (one.label.split()[0], int(one.label.split()[1]))))
+    words = ("Figure", "Table", "Text", "Erratum")
+    return tuple(sorted(items, key=lambda one: (words.index(one.label.split()[0]), int(one.label.split()[1]))))

@@ -1,4 +1,4 @@
-"""Records of reproduced figures and tables: what was compared, when, with what and where."""
+"""Records of reproduced items: what was compared, when, with what and where."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 import torchsar
-from torchsar.reproduce.item import Check, Item, Paper, settled
+from torchsar.reproduce.item import NOT_REPRODUCED, Check, Fact, Item, Made, Paper, settled
 
 # significant digits of a recorded number
 DIGITS = 6
@@ -62,20 +62,26 @@ def commit() -> str | None:
         return None
 
 
-def entry(item: Item, checks: list[Check], made: Mapping[str, Any] | None) -> dict[str, Any]:
+def entry(item: Item, found: Made, made: Mapping[str, Any] | None) -> dict[str, Any]:
     """Describe a reproduced item.
 
     Args:
         item: The item.
-        checks: What was compared of it.
+        found: What was compared of it, and the facts of its reason.
         made: How it was made; None where nothing was computed.
 
     Returns:
         A tree that JSON can hold.
     """
-    rows = [{key: _rounded(value) for key, value in asdict(check).items()} for check in checks]
-    found = {"item": item.label, "kind": item.kind, "subject": item.subject, "verdict": settled(item, checks)}
-    return {**found, "why": item.why if found["verdict"] == "not reproduced" else "", "made": made, "checks": rows}
+    checks, facts = [one for one in found if isinstance(one, Check)], [one for one in found if isinstance(one, Fact)]
+    result = settled(item, checks)
+    said = item.reason(facts) if result in (NOT_REPRODUCED, "unpublished") else ""
+    trees = {
+        name: [{key: _rounded(value) for key, value in asdict(one).items()} for one in rows]
+        for name, rows in (("facts", facts if said else []), ("checks", checks))
+    }
+    about = {"item": item.label, "kind": item.kind, "subject": item.subject, "verdict": result, "why": said}
+    return {**about, "made": made, **trees}
 
 
 def _rounded(value: Any) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torchsar.reproduce.geo import geometry, ocean, reconstruction, sensor, targets, velocity
+from torchsar.reproduce.geo import geometry, ocean, reconstruction, sensor, targets, text, velocity
 from torchsar.reproduce.item import Item, Paper, in_order
 
 __all__ = ["PAPER"]
@@ -12,9 +12,9 @@ PAPER = Paper(
     "geo",
     "Azimuth multichannel reconstruction for moving targets in GEO-SA-BiSAR, Remote Sens. 2020, 12, 1703",
     in_order(
-        Item("Figure 1", "geometry of the observation", "diagram"),
-        Item("Figure 9", "flow of the reconstruction", "diagram"),
-        Item("Figure 13", "flow of the imaging of moving targets", "diagram"),
-        *(item for part in (sensor, geometry, targets, reconstruction, velocity, ocean) for item in part.ITEMS),
+        Item("Figure 1", "geometry of the observation", kind="diagram"),
+        Item("Figure 9", "flow of the reconstruction", kind="diagram"),
+        Item("Figure 13", "flow of the imaging of moving targets", kind="diagram"),
+        *(item for part in (sensor, geometry, targets, reconstruction, velocity, ocean, text) for item in part.ITEMS),
     ),
 )

@@ -43,4 +43,4 @@ def _table_1(small: bool, path: Path) -> list[Check]:
     return parameters(rows, 1e-6)
 
 
-ITEMS = (Item("Table 1", "parameters of the simulation", "table", bool, _table_1),)
+ITEMS = (Item("Table 1", "parameters of the simulation", bool, _table_1),)

@@ -2,9 +2,11 @@
 17, 3447, with a procedural satellite in place of the one that is not published.
 
 The image without compensation, as a sum of chirplets (ACL), with the acceleration alone taken out
-(SM), and with the recommended estimate of the whole rotation; the positions of both panel tips in
+((SM), and with the recommended estimate of the whole rotation; the positions of both panel tips in
 the image that is scaled to metres; and Newton's method, which the paper calls Gauss-Newton, from
-0.9, 1 and 1.1 times the truth.
+0.9, 1 and 1.1 times the truth, on images of 8 lines per Doppler cell. With fewer lines the least
+entropy lies farther from the truth (see `EntropyObjective`). Numbers are means over scenes, each
+with noise of its own; pictures show the first scene.
 """
 
 from __future__ import annotations
@@ -32,7 +34,7 @@ from torchsar.metrics import entropy, impulse_response
 from torchsar.radar import InverseRadar
 from torchsar.reproduce.isal_rotation.common import focused, in_metres, known_of, ladar, second_order
 from torchsar.reproduce.isal_rotation.profiles import OMEGA_RAD_S, WARP_K
-from torchsar.reproduce.item import Check, Item, falling, number, statement
+from torchsar.reproduce.item import Check, Item, falling, misprint, number, statement
 from torchsar.scene import PolynomialRotation, Satellite, TurntableWorld
 
 ROTATION = PolynomialRotation(OMEGA_RAD_S, WARP_K)
@@ -41,6 +43,8 @@ TIP_M = 6.43
 # chosen: pulse rate, pulses, cells, cell size, scatterers, chirplets, in the full and reduced forms
 SIZES = {False: (500e3, 10000, 32, 0.24, 300, 16), True: (50e3, 1000, 32, 0.24, 60, 4)}
 SNR_DB = 20.0
+# scenes in the full form, and lines per Doppler cell of the images of Newton's method
+SCENES, LINES_PER_CELL = 5, 8.0
 # estimates of the genetic algorithm in the text (rad/s, 1/s, 1/s2), and tolerances
 PUBLISHED = {
     "omega_rad_s": (0.0202, 0.0004),
@@ -65,9 +69,6 @@ class _Imaged:
     truth: Truth
     half_width_m: float
 
-    def entropies(self, *names: str) -> dict[str, float]:
-        return {name: float(entropy(self.shown[name])) for name in names}
-
     def whole(self, name: str) -> Signal:
         """The target in the image of a method, 1.09 times its cross range."""
         return _cut(self.shown[name], 0.0, 1.09 * self.half_width_m, (-3.8, 3.8))
@@ -85,13 +86,46 @@ class _Imaged:
         }
 
 
-def _satellite(small: bool) -> _Imaged:
-    prf_hz, n_pulse, n_range, cell_m, count, atoms = SIZES[small]
+def simulated(small: bool, seed: int) -> tuple[Signal, Truth, InverseRadar]:
+    """Simulate a scene.
+
+    Args:
+        small: Whether to take the tiny satellite.
+        seed: Seed of scene and noise.
+
+    Returns:
+        Range-compressed pulses, truth and ladar.
+    """
+    prf_hz, n_pulse, n_range, cell_m, count, _ = SIZES[small]
     radar = ladar(cell_m, prf_hz)
-    half_width_m = TIP_M * prf_hz / 500e3
-    world = TurntableWorld(Satellite(count, half_width_m), rotation=ROTATION, snr_db=SNR_DB)
-    recording, truth = simulate_turntable(radar, world, n_pulse, n_range, Draws(1))
-    signal, focus = recording.signal, MatchedFourier(radar)
+    world = TurntableWorld(Satellite(count, TIP_M * prf_hz / 500e3), rotation=ROTATION, snr_db=SNR_DB)
+    recording, truth = simulate_turntable(radar, world, n_pulse, n_range, Draws(seed))
+    return recording.signal, truth, radar
+
+
+def _satellite(small: bool) -> list[_Imaged]:
+    return [_imaged(small, seed) for seed in seeds_of(small)]
+
+
+def seeds_of(small: bool) -> range:
+    """Return the seeds of the scenes.
+
+    Args:
+        small: Whether it is the reduced form, with one scene.
+
+    Returns:
+        The seeds.
+    """
+    return range(1, 2 if small else SCENES + 1)
+
+
+def _entropies(seen: list[_Imaged], *names: str) -> dict[str, list[float]]:
+    return {name: [float(entropy(one.shown[name])) for one in seen] for name in names}
+
+
+def _imaged(small: bool, seed: int) -> _Imaged:
+    signal, truth, radar = simulated(small, seed)
+    prf_hz, n_pulse, atoms, focus = radar.prf_hz, signal.axis("pulse").n, SIZES[small][-1], MatchedFourier(radar)
     estimate, uncompensated = uneven_rotation(signal.data, **known_of(signal, radar)), focus(signal)
     made = {
         "no compensation": uncompensated,
@@ -101,16 +135,17 @@ def _satellite(small: bool) -> _Imaged:
         "order 3, two-dimensional": focused(signal, radar, estimate.value),
     }
     rate = mean_rate(estimate["omega_rad_s"], estimate["warp_k"], n_pulse / prf_hz)
-    return _Imaged({name: in_metres(x, radar, rate) for name, x in made.items()}, estimate, truth, half_width_m)
+    shown = {name: in_metres(x, radar, rate) for name, x in made.items()}
+    return _Imaged(shown, estimate, truth, TIP_M * prf_hz / 500e3)
 
 
 def _cut(image: Signal, middle_m: float, half_m: float, range_m: tuple[float, float]) -> Signal:
     return plot.within(image, {"azimuth": (middle_m - half_m, middle_m + half_m), "range": range_m})
 
 
-def _figure_4(seen: _Imaged, path: Path) -> list[Check]:
+def _figure_4(seen: list[_Imaged], path: Path) -> list[Check]:
     """Nothing is published to compare it with."""
-    x, y, level = (plot.array(seen.truth.values[name]) for name in ("cross_range_m", "range_m", "amplitude"))
+    x, y, level = (plot.array(seen[0].truth.values[name]) for name in ("cross_range_m", "range_m", "amplitude"))
     title = f"{len(x)} scatterers, with areas as their amplitudes"
     plot.save(plot.scatterers(y, x, abs(level), "range (m)", "cross range (m)", title), path)
     return []
@@ -122,71 +157,71 @@ def _draw(seen: _Imaged, name: str, path: Path) -> None:
     plot.save(plot.images(parts, 40, percentile=100, lines={name: seen.outlines()}), path, columns=3)
 
 
-def _figure_5(seen: _Imaged, path: Path) -> list[Check]:
-    _draw(seen, "no compensation", path)
-    return [falling("entropy (nats)", seen.entropies("no compensation", "order 3, two-dimensional"))]
+def _figure_5(seen: list[_Imaged], path: Path) -> list[Check]:
+    _draw(seen[0], "no compensation", path)
+    return [falling("entropy (nats)", _entropies(seen, "no compensation", "order 3, two-dimensional"))]
 
 
-def _figure_6(seen: _Imaged, path: Path) -> list[Check]:
+def _figure_6(seen: list[_Imaged], path: Path) -> list[Check]:
     """Samples above -30 dB of the peak."""
-    _draw(seen, "chirplets (ACL)", path)
-    level = {name: seen.shown[name].data.abs() for name in ("chirplets (ACL)", "order 3, two-dimensional")}
-    bright = {name: int((x > 10**-1.5 * x.max()).sum()) for name, x in level.items()}
-    few, all_ = bright.values()
-    ours = f"{few} samples above -30 dB, {all_} in the compensated image"
-    return [statement("chirplets", "leave out weak parts of the target", few < all_, ours)]
+    _draw(seen[0], "chirplets (ACL)", path)
+    names = ("chirplets (ACL)", "order 3, two-dimensional")
+    levels = [[one.shown[name].data.abs() for one in seen] for name in names]
+    few, all_ = ([int((x > 10**-1.5 * x.max()).sum()) for x in row] for row in levels)
+    ours = f"{sum(few) / len(few):.0f} samples above -30 dB, {sum(all_) / len(all_):.0f} in the compensated image"
+    holds = all(a < b for a, b in zip(few, all_, strict=True))
+    return [statement("chirplets", "leave out weak parts of the target", holds, ours, len(seen))]
 
 
-def _figure_7(seen: _Imaged, path: Path) -> list[Check]:
-    _draw(seen, "SM, order 2", path)
-    return [falling("entropy (nats)", seen.entropies("no compensation", "SM, order 2", "order 3, two-dimensional"))]
+def _figure_7(seen: list[_Imaged], path: Path) -> list[Check]:
+    _draw(seen[0], "SM, order 2", path)
+    return [falling("entropy (nats)", _entropies(seen, "no compensation", "SM, order 2", "order 3, two-dimensional"))]
 
 
-def _figure_8(seen: _Imaged, path: Path) -> list[Check]:
+def _figure_8(seen: list[_Imaged], path: Path) -> list[Check]:
     """The recommended estimator, which gets the data alone; and all methods in one picture."""
-    _draw(seen, "order 3, two-dimensional", path)
-    shown = {name: seen.whole(name) for name in SHOWN} | {f"{name}, A": seen.region(name, TIP) for name in SHOWN}
+    _draw(seen[0], "order 3, two-dimensional", path)
+    first = seen[0]
+    shown = {name: first.whole(name) for name in SHOWN} | {f"{name}, A": first.region(name, TIP) for name in SHOWN}
     peaks = {name: image.data.abs().max() for name, image in shown.items()}
     # each in dB of the peak of its whole image
     shown = {name: image.with_data(image.data / peaks[name.removesuffix(", A")]) for name, image in shown.items()}
-    lines = {name: {TIP: seen.outlines()[TIP]} for name in SHOWN}
+    lines = {name: {TIP: first.outlines()[TIP]} for name in SHOWN}
     plot.save(plot.images(shown, 40, percentile=100, lines=lines), path.with_stem(f"{path.stem}_methods"))
     return [
-        falling("entropy (nats)", seen.entropies("SM, order 2", "order 3, azimuth", "order 3, two-dimensional")),
+        falling("entropy (nats)", _entropies(seen, "SM, order 2", "order 3, azimuth", "order 3, two-dimensional")),
         *(
-            number(name, published, float(seen.estimate[name]), within, std=float(seen.estimate.std[name]))
+            number(name, published, [float(one.estimate[name]) for one in seen], within)
             for name, (published, within) in PUBLISHED.items()
         ),
     ]
 
 
-def _figure_9(seen: _Imaged, path: Path) -> list[Check]:
+def _figure_9(seen: list[_Imaged], path: Path) -> list[Check]:
     """Both tips are enlarged, with the true position of the brightest scatterer of each."""
-    best = seen.shown["order 3, two-dimensional"]
-    x, y, level = (seen.truth.values[name] for name in ("cross_range_m", "range_m", "amplitude"))
-    tips = []
-    for side in (-1, 1):
-        which = int(torch.where(side * x > 0.999 * x.abs().max(), level.abs(), 0).argmax())
-        at = float(x[which]), float(y[which])
-        tips.append((*at, float(impulse_response(best, at, search_m=0.1)["position_azimuth_m"])))
-    shown, lines = {"scaled to metres": seen.whole("order 3, two-dimensional")}, {}
+    tips, best = _tips(seen[0]), seen[0].shown["order 3, two-dimensional"]
+    shown, lines = {"scaled to metres": seen[0].whole("order 3, two-dimensional")}, {}
     for true_m, range_m, _ in tips:
         title = f"tip at {true_m:.2f} m"
         shown[title] = _cut(best, true_m, REGION_M, (range_m - 1.6, range_m + 1.6))
         lines[title] = {"true position": plot.boxes([(range_m, true_m)], 0.3, 0.1 * REGION_M)}
     plot.save(plot.images(shown, 40, percentile=100, lines=lines), path, columns=3)
     ours = ", ".join(f"{seen_m:.3f} m for {true_m:.3f} m" for true_m, _, seen_m in tips)
-    close = all(abs(seen_m / true_m - 1) < 0.02 for true_m, _, seen_m in tips)
-    return [statement("tips of the panels", "scaled consistently with the simulation", close, ours)]
+    worst = max(abs(seen_m / true_m - 1) for one in seen for true_m, _, seen_m in _tips(one))
+    ours += f"; at most {100 * worst:.2f} % off in all scenes"
+    return [statement("tips of the panels", "scaled consistently with the simulation", worst < 0.02, ours, len(seen))]
 
 
-def _table_1(seen: _Imaged, path: Path) -> list[Check]:
-    """What the text says of it."""
-    return [
-        number("rate (rad/s)", 0.002, OMEGA_RAD_S, 1e-6),
-        number("acceleration (rad/s2)", 0.2, OMEGA_RAD_S * WARP_K[0], 1e-6),
-        number("jerk (rad/s3)", 20.0, OMEGA_RAD_S * WARP_K[1], 1e-6),
-    ]
+def _tips(one: _Imaged) -> list[tuple[float, float, float]]:
+    """True cross range, range and measured cross range (m) of both tips."""
+    best = one.shown["order 3, two-dimensional"]
+    x, y, level = (one.truth.values[name] for name in ("cross_range_m", "range_m", "amplitude"))
+    tips = []
+    for side in (-1, 1):
+        which = int(torch.where(side * x > 0.999 * x.abs().max(), level.abs(), 0).argmax())
+        at = float(x[which]), float(y[which])
+        tips.append((*at, float(impulse_response(best, at, search_m=0.1)["position_azimuth_m"])))
+    return tips
 
 
 # rate, k1 and k2 of the text (rad/s, 1/s, 1/s2)
@@ -201,44 +236,42 @@ PART = (0.35, 0.45)
 
 @dataclass(frozen=True)
 class _Seen:
-    """The data, and estimates by start; of None, the recommended one, which needs none."""
+    """The first scene, and relative errors of the rate, k1 and k2 of every scene (scene, 3) by
+    start; of None, those of the recommended estimator, which needs none.
+    """
 
     signal: Signal
     radar: InverseRadar
-    found: dict[float | None, Estimate]
-
-    def error(self, factor: float | None) -> torch.Tensor:
-        """Relative errors of the rate, k1 and k2."""
-        return torch.stack([self.found[factor][name] for name in NAMES]) / TRUTH - 1
+    first: dict[float | None, Estimate]
+    error: dict[float | None, torch.Tensor]
 
 
 def _starts(small: bool) -> _Seen:
-    """A tiny satellite and one step in the reduced form."""
-    prf_hz, n_pulse, n_range, cell_m, count, _ = SIZES[small]
-    radar = ladar(cell_m, prf_hz)
-    world = TurntableWorld(Satellite(count, TIP_M * prf_hz / 500e3), rotation=ROTATION, snr_db=SNR_DB)
-    signal = simulate_turntable(radar, world, n_pulse, n_range, Draws(1))[0].signal
-    found: dict[float | None, Estimate] = {}
-    for factor in FACTORS:
-        figure = ImageEntropy.of(signal, radar, EntropyObjective(oversampling=2.0))
-        start = figure.start(factor * TRUTH[0], factor * TRUTH[1:])
-        found[factor] = entropy_rotation(figure, "newton", start, damped=False, steps=1 if small else 20)
-    found[None] = uneven_rotation(signal.data, **known_of(signal, radar))
-    return _Seen(signal, radar, found)
+    """A tiny satellite, 2 lines per cell and one step in the reduced form."""
+    scenes = [simulated(small, seed) for seed in seeds_of(small)]
+    found = [{factor: _started(*scene, factor, small) for factor in (*FACTORS, None)} for scene in scenes]
+    error = {
+        factor: torch.stack([torch.stack([one[factor][name] for name in NAMES]) / TRUTH - 1 for one in found])
+        for factor in found[0]
+    }
+    signal, _, radar = scenes[0]
+    return _Seen(signal, radar, found[0], error)
+
+
+def _started(signal: Signal, truth: Truth, radar: InverseRadar, factor: float | None, small: bool) -> Estimate:
+    """Newton's method from a factor times the truth, or the recommended estimator."""
+    if factor is None:
+        return uneven_rotation(signal.data, **known_of(signal, radar))
+    figure = ImageEntropy.of(signal, radar, EntropyObjective(oversampling=2.0 if small else LINES_PER_CELL))
+    start = figure.start(factor * TRUTH[0], factor * TRUTH[1:])
+    return entropy_rotation(figure, "newton", start, damped=False, steps=1 if small else 10)
 
 
 def _compensated(seen: _Seen, factor: float | None) -> Signal:
     """Image in Doppler, since a wrong rate gives a wrong scale."""
-    image = focused(seen.signal, seen.radar, seen.found[factor].value)
+    image = focused(seen.signal, seen.radar, seen.first[factor].value)
     doppler, range_ = image.axes
     return Signal(image.data, (Axis("Doppler", doppler.n, 1e-3 * doppler.start, 1e-3 * doppler.step, "kHz"), range_))
-
-
-def _words(seen: _Seen, factor: float | None) -> str:
-    return ", ".join(
-        f"{name} {100 * float(error):+.2g} %"
-        for name, error in zip(("Om", "k1", "k2"), seen.error(factor), strict=True)
-    )
 
 
 def _picture(factor: float) -> Callable[[_Seen, Path], list[Check]]:
@@ -256,63 +289,60 @@ def _picture(factor: float) -> Callable[[_Seen, Path], list[Check]]:
             middle, height = half * sum(PART) / 2, half * (PART[1] - PART[0]) / 2
             lines[title] = {"part": plot.boxes([(middle_m, middle)], half_m, height)}
         plot.save(plot.images(shown, 40, percentile=100, lines=lines), path)
-        return [_outcome(seen, factor)]
+        return _outcome(seen, factor)
 
     return make
 
 
-def _outcome(seen: _Seen, factor: float) -> Check:
-    close = bool((seen.error(factor).abs() < CLOSE).all())
-    claim = "close to the truth, focused" if factor == 1 else "far from the truth, defocused"
-    return statement(f"Newton's method {BEGINNINGS[factor]}", claim, close == (factor == 1), _words(seen, factor))
+def _outcome(seen: _Seen, factor: float | None) -> list[Check]:
+    """Close to the truth: within 5 % in the mean; far from it: beyond it in every scene."""
+    title = f"Newton's method {BEGINNINGS[factor]}" if factor else "recommended, without a start"
+    percent, errors = 100 * CLOSE, 100 * seen.error[factor]
+    if factor in (1.0, None):
+        rows = zip(("rate", "k1", "k2"), errors.T.tolist(), strict=True)
+        return [number(f"{title}: error of {name} (%)", 0.0, row, percent) for name, row in rows]
+    worst = errors.abs().amax(-1)
+    ours = f"largest error of the three {float(worst.min()):.3g} % or more in {len(worst)} scenes"
+    return [statement(title, "far from the truth, defocused", bool((worst > percent).all()), ours, len(worst))]
 
 
 def _table_2(seen: _Seen, path: Path) -> list[Check]:
-    best = bool((seen.error(None).abs() < CLOSE).all())
+    return [check for factor in (*FACTORS, None) for check in _outcome(seen, factor)]
+
+
+def _table_1(seen: list[_Imaged], path: Path) -> list[Check]:
+    """What the text says of it."""
+    shown = OMEGA_RAD_S * WARP_K[0] == 0.2 and OMEGA_RAD_S * WARP_K[1] == 20.0
+    ours = (
+        f"0.2 rad/s2 and 20 rad/s3 over the printed estimates {WARP_K[0]:g} 1/s and {WARP_K[1]:g} 1/s2 are "
+        f"{1e3 * OMEGA_RAD_S:g} mrad/s"
+    )
     return [
-        *(_outcome(seen, factor) for factor in FACTORS),
-        statement("without a start", "a method that needs none is close to the truth", best, _words(seen, None)),
+        misprint("rate", "2 mrad/s", shown, ours),
+        number("acceleration (rad/s2)", 0.2, OMEGA_RAD_S * WARP_K[0], 1e-6),
+        number("jerk (rad/s3)", 20.0, OMEGA_RAD_S * WARP_K[1], 1e-6),
     ]
 
 
-LOST = (
-    "the entropy is so flat in the rate that an undamped step from the truth itself is too long; with a line search "
-    "all three starts reach the same minimum"
-)
 # figures and tables, by their numbers
-STARTS = (
-    *(
-        Item(
-            f"Figure {label}",
-            f"image by Newton's method {BEGINNINGS[factor]}",
-            of=_starts,
-            make=_picture(factor),
-            why=LOST,
-        )
-        for label, factor in zip((10, 11, 12), FACTORS, strict=True)
-    ),
-    Item("Table 2", "estimates by Newton's method from three starts", "table", _starts, _table_2, LOST),
-)
 ITEMS = (
-    *STARTS,
     Item(
         "Figure 4",
-        "model of the target",
-        of=_satellite,
-        make=_figure_4,
-        why="the model is not published; the picture shows the procedural satellite that stands in for it",
-    ),
-    Item("Figure 5", "image without compensation", of=_satellite, make=_figure_5),
-    Item("Figure 6", "image by adaptive chirplets (ACL)", of=_satellite, make=_figure_6),
-    Item("Figure 7", "image with compensation of second order (SM)", of=_satellite, make=_figure_7),
-    Item("Figure 8", "image with two-dimensional compensation of third order", of=_satellite, make=_figure_8),
-    Item("Figure 9", "the same, scaled to metres", of=_satellite, make=_figure_9),
-    Item(
-        "Table 1",
-        "parameters of the simulation",
-        "table",
+        "model of the target; the picture shows the procedural satellite that stands in for it",
         _satellite,
-        _table_1,
-        "the rate of 2 mrad/s in the text contradicts the estimates of 10 1/s and 1000 1/s2, which 20 mrad/s gives",
+        _figure_4,
+        "the model is not published",
+        "unpublished",
     ),
+    Item("Figure 5", "image without compensation", _satellite, _figure_5),
+    Item("Figure 6", "image by adaptive chirplets (ACL)", _satellite, _figure_6),
+    Item("Figure 7", "image with compensation of second order (SM)", _satellite, _figure_7),
+    Item("Figure 8", "image with two-dimensional compensation of third order", _satellite, _figure_8),
+    Item("Figure 9", "the same, scaled to metres", _satellite, _figure_9),
+    *(
+        Item(f"Figure {label}", f"image by Newton's method {BEGINNINGS[factor]}", _starts, _picture(factor))
+        for label, factor in zip((10, 11, 12), FACTORS, strict=True)
+    ),
+    Item("Table 1", "parameters of the simulation", _satellite, _table_1),
+    Item("Table 2", "estimates by Newton's method from three starts", _starts, _table_2),
 )

@@ -288,6 +288,6 @@ ITEMS = (
     Item("Figure 7", "range profiles and image after compensation", of=_three_points, make=_figure_7),
     Item("Figure 8", "contours of the points before and after compensation", of=_three_points, make=_figure_8),
     Item("Figure 9", "impulse response in range and azimuth", of=_three_points, make=_figure_9),
-    Item("Table 1", "parameters of the simulation", "table", _three_points, _table_1),
-    Item("Table 2", "quality of the impulse response", "table", _three_points, _table_2),
+    Item("Table 1", "parameters of the simulation", _three_points, _table_1),
+    Item("Table 2", "quality of the impulse response", _three_points, _table_2),
 )
