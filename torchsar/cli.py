@@ -32,7 +32,7 @@ _EXCHANGE = {
     "import": "write recorded data of another format, which a sidecar describes, as a recording (.npz)",
     "export": "write the images of a finished run, or its recording, in another format",
 }
-_REPRODUCE = "make the figures and tables of the papers, and compare them with what was published"
+_REPRODUCE = "make the figures, tables and numbers of the papers, and compare them with what was published"
 
 
 # commands that only print, and need no device
@@ -93,7 +93,7 @@ def parser() -> argparse.ArgumentParser:
     )
     one = commands.add_parser("reproduce", help=_REPRODUCE, description=_REPRODUCE[0].upper() + _REPRODUCE[1:] + ".")
     one.add_argument("paper", nargs="?", metavar="PAPER", help="sal, geo, isal, isal_rotation or stripmap; all without")
-    one.add_argument("item", nargs="?", metavar="ITEM", help="such as table2 or figure5; all without")
+    one.add_argument("item", nargs="?", metavar="ITEM", help="such as table2, figure5 or text1; all without")
     one.add_argument("--small", action="store_true", help="the reduced form, which takes minutes in all")
     one.add_argument(
         "--out", type=_place, default=Path("out") / "reproduce", metavar="DIR", help="folder of records and pictures"

@@ -21,6 +21,7 @@ from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
 from torchsar import plot
+from torchsar.reproduce.item import SHOWN
 from torchsar.study.trials.choice import EXACT_DB
 
 # the order of the systems in tables
@@ -322,7 +323,7 @@ class ReproducedTable(SphinxDirective):
 
     def run(self) -> list[nodes.Node]:
         record = read(self, "reproduce", self.arguments[0])
-        lines = ["| item | compared | published | ours | verdict |", "| --- | --- | --- | --- | --- |"]
+        lines = ["| item | compared | published | ours | draws | verdict |", "| --- | --- | --- | --- | --- | --- |"]
         for found in record["items"]:
             lines += self.rows(found)
         made = {json.dumps({**one["made"], "seconds": None}): one["made"] for one in record["items"] if one["made"]}
@@ -341,19 +342,33 @@ class ReproducedTable(SphinxDirective):
         """A row for the item, and one for each comparison."""
         form = " (reduced form)" if found["made"] and found["made"]["form"] == "reduced" else ""
         why = f": {found['why']}" if found["why"] else ""
-        lines = [f"| **{found['item']}** | *{found['subject']}*{why} | | | **{found['verdict']}**{form} |"]
+        lines = [f"| **{found['item']}** | *{found['subject']}*{why} | | | | **{found['verdict']}**{form} |"]
         for check in found["checks"]:
             published, ours = (x if isinstance(x, str) else short(x) for x in (check["published"], check["ours"]))
             std = "" if not check["std"] else f" ± {check['std']:.2g}"
-            lines.append(f"| | {check['name']} | {published} | {ours}{std} | {check['verdict']} |")
+            draws = check["draws"] or ""
+            lines.append(f"| | {check['name']} | {published} | {ours}{std} | {draws} | {check['verdict']} |")
         return [line.replace("\n", " ") for line in lines]
+
+
+class ReproducedErrors(SphinxDirective):
+    """What the papers have wrong, from the records of all papers."""
+
+    def run(self) -> list[nodes.Node]:
+        lines = ["| paper | item | what | printed | what shows it |", "| --- | --- | --- | --- | --- |"]
+        for path in sorted((Path(self.env.srcdir) / "reproduce").glob("*.json")):
+            for found in read(self, "reproduce", path.stem)["items"]:
+                wrong = [check for check in found["checks"] if check["verdict"] == "error of the paper"]
+                words = [f"{found['item']} | {x['name']} | {x['published']} | {x['ours']}" for x in wrong]
+                lines += [f"| `{path.stem}` | {row} |" for row in words]
+        return self.parse_text_to_nodes("\n".join(lines))
 
 
 class ReproducedCounts(SphinxDirective):
     """How many figures and tables of every paper have which verdict; a reduced form has none."""
 
     def run(self) -> list[nodes.Node]:
-        words = ("reproduced", "better", "not reproduced", "reduced form only", "diagram", "photograph")
+        words = ("reproduced", "better", "not reproduced", "reduced form only", "error of the paper", *SHOWN)
         lines = [f"| paper | {' | '.join(words)} |", f"| --- {'| ---: ' * len(words)}|"]
         for path in sorted((Path(self.env.srcdir) / "reproduce").glob("*.json")):
             items = read(self, "reproduce", path.stem)["items"]
@@ -376,6 +391,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
         "requires-table": RequiresTable,
         "reproduced-table": ReproducedTable,
         "reproduced-counts": ReproducedCounts,
+        "reproduced-errors": ReproducedErrors,
     }.items():
         app.add_directive(name, directive)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -124,129 +124,120 @@ def _about(strip: _Strip, image: Signal, azimuth_m: float = 250.0, range_m: floa
 
 
 def _figure_2(strips: list[_Strip], path: Path) -> list[Check]:
-    right, wrong, all_ = [], [], []
-    for strip in strips:
-        impaired, true = strip.impaired(tone=TONE)
-        found, lines = find_contamination(impaired.signal.data).lines, true["tone.contaminated"]
-        right.append(int((found & lines).sum()))
-        wrong.append(int((found & ~lines).sum()))
-        all_.append(int(lines.sum()))
-    data = strips[0].impaired(tone=TONE)[0].signal
+    damaged = [strip.impaired(tone=TONE) for strip in strips]
+    data = damaged[0][0].signal
     plot.save(plot.image(data.with_data(data.data.real + 0j), 40, "quadrature of the raw data, with a tone"), path)
-    ours = f"{sum(right)} of {sum(all_)} lines with the tone found, {sum(wrong)} others"
-    holds = right == all_ and not any(wrong)
+    lines = torch.stack([true["tone.contaminated"] for _, true in damaged])
+    found = torch.stack([find_contamination(one.signal.data).lines for one, _ in damaged])
+    right, wrong = int((found & lines).sum()), int((found & ~lines).sum())
+    ours = f"{right} of {int(lines.sum())} lines with the tone found, {wrong} others"
+    holds = bool((found == lines).all())
     return [statement("lines with an external signal", "stand out from the others", holds, ours, len(strips))]
 
 
 def _figure_3(strips: list[_Strip], path: Path) -> list[Check]:
-    least, most = [], []
     damaged = [strip.impaired(tone=TONE) for strip in strips]
-    each = [torch.fft.fftshift(torch.fft.fft(one.signal.data), dim=-1).abs() for one, _ in damaged]
-    for spectra, (_, true) in zip(each, damaged, strict=True):
-        lines = true["tone.contaminated"]
-        over = 20 * torch.log10(spectra.amax(-1) / spectra.median(-1).values)
-        least.append(float(over[lines].min()))
-        most.append(float(over[~lines].max()))
-    spectra, lines = each[0], damaged[0][1]["tone.contaminated"]
+    lines = torch.stack([true["tone.contaminated"] for _, true in damaged])
+    spectra = torch.fft.fftshift(torch.fft.fft(torch.stack([one.signal.data for one, _ in damaged])), dim=-1).abs()
     mhz = 1e-6 * RADAR.sampling_hz * (torch.arange(SAMPLES, dtype=torch.float64) / SAMPLES - 0.5)
-    index = {"with the external signal": int(lines.nonzero()[0]), "without": int((~lines).nonzero()[0])}
-    top = float(spectra[lines].max())
+    index = {"with the external signal": int(lines[0].nonzero()[0]), "without": int((~lines[0]).nonzero()[0])}
+    top = float(spectra[0][lines[0]].max())
     part = {
-        "series": {name: (plot.array(mhz), plot.decibel(spectra[i], top)) for name, i in index.items()},
+        "series": {name: (plot.array(mhz), plot.decibel(spectra[0, i], top)) for name, i in index.items()},
         "xlabel": "frequency (MHz)",
         "ylabel": "amplitude (dB)",
         "title": "spectra of two lines",
         "ylim": (-70.0, 2.0),
     }
     plot.save(plot.panels([part]), path, columns=1)
-    ours = f"peak over median: at least {min(least):.0f} dB with it, at most {max(most):.0f} dB without"
+    over = 20 * torch.log10(spectra.amax(-1) / spectra.median(-1).values)
+    least, most = float(over[lines].min()), float(over[~lines].max())
+    ours = f"peak over median: at least {least:.0f} dB with it, at most {most:.0f} dB without"
     claim = "a narrow peak tells that the line is contaminated"
-    return [statement("spectrum", claim, min(least) > max(most), ours, len(strips))]
+    return [statement("spectrum", claim, least > most, ours, len(strips))]
+
+
+def _jittered(strip: _Strip) -> tuple[Signal, Signal]:
+    """Images with jitter and after its correction."""
+    impaired, _ = strip.impaired(jitter=JITTER)
+    found = PilotJitter()(impaired.signal, impaired.aux["pilot"])
+    corrected = CorrectJitter()(impaired.signal, found["offset_samples"], found["period"])
+    assert isinstance(corrected, Signal)
+    return _focused(impaired.signal, DOPPLER_HZ), _focused(corrected, DOPPLER_HZ)
 
 
 def _figure_4(strips: list[_Strip], path: Path) -> list[Check]:
-    before, after = [], []
-    for strip in reversed(strips):
-        impaired, _ = strip.impaired(jitter=JITTER)
-        found = PilotJitter()(impaired.signal, impaired.aux["pilot"])
-        corrected = CorrectJitter()(impaired.signal, found["offset_samples"], found["period"])
-        assert isinstance(corrected, Signal)
-        images = {
-            "with jitter": _focused(impaired.signal, DOPPLER_HZ),
-            "jitter corrected": _focused(corrected, DOPPLER_HZ),
-        }
-        for kept, image in zip((before, after), images.values(), strict=True):
-            kept.append(strip.error_db(image))
-    shown = {name: _about(strips[0], image) for name, image in images.items()}
+    images = [_jittered(strip) for strip in strips]
+    names = ("with jitter", "jitter corrected")
+    shown = {name: _about(strips[0], image) for name, image in zip(names, images[0], strict=True)}
     plot.save(plot.images(shown, 50, percentile=100), path)
-    ours = f"error of the image {min(before):.1f} dB or more, {max(after):.1f} dB or less after correction"
-    holds = max(after) < min(before) - 40
-    return [statement("false repeats along range", "are removed by the correction", holds, ours, len(strips))]
+    errors = [[strip.error_db(image) for image in pair] for strip, pair in zip(strips, images, strict=True)]
+    before, after = min(one for one, _ in errors), max(one for _, one in errors)
+    ours = f"error of the image {before:.1f} dB or more, {after:.1f} dB or less after correction"
+    return [
+        statement("false repeats along range", "are removed by the correction", after < before - 40, ours, len(strips))
+    ]
 
 
 def _figure_5(recordings: list[Recording], path: Path) -> list[Check]:
-    blocks, means = [], []
-    for recording in recordings:
-        found = phase_increment(recording.signal.data, RADAR.prf_hz, (BLOCKS, 1))
-        blocks.append(found.info["block_hz"].flatten())
-        means.append(float(found["doppler_baseband_hz"]))
-    true = DOPPLER_HZ - RADAR.prf_hz
-    turns = 2 * math.pi / RADAR.prf_hz
+    found = [phase_increment(one.signal.data, RADAR.prf_hz, (BLOCKS, 1)) for one in recordings]
+    blocks = torch.stack([one.info["block_hz"].flatten() for one in found])
+    means = torch.stack([one["doppler_baseband_hz"] for one in found])
+    true, turns = DOPPLER_HZ - RADAR.prf_hz, 2 * math.pi / RADAR.prf_hz
     line = (torch.arange(BLOCKS, dtype=torch.float64) + 0.5) * LINES / BLOCKS
     part = {
         "series": {"blocks": (plot.array(line), plot.array(turns * blocks[0]))}
         | {
             name: (plot.array(line), plot.array(torch.full_like(line, turns * x)))
-            for name, x in (("mean", means[0]), ("true", true))
+            for name, x in (("mean", float(means[0])), ("true", true))
         },
         "xlabel": "line",
         "ylabel": "phase increment (rad)",
         "title": "phase increment along the strip",
     }
     plot.save(plot.panels([part]), path, columns=1)
-    spread = min(float(block.std()) for block in blocks)
-    error = math.sqrt(sum((mean - true) ** 2 for mean in means) / len(means))
+    spread, error = float(blocks.std(-1).min()), float((means - true).square().mean().sqrt())
     ours = f"blocks scatter by {spread:.1f} Hz or more, their mean is {error:.1f} Hz off (rms)"
     claim = "varies with the scene at a constant squint; the mean tells the centroid"
-    return [statement("estimate", claim, error < spread / 2, ours, len(means))]
+    return [statement("estimate", claim, error < spread / 2, ours, len(found))]
+
+
+def _lost(
+    strips: list[_Strip], wrong_hz: float, names: tuple[str, str], path: Path
+) -> tuple[float, float, list[float], list[float]]:
+    """Draw images with a wrong and with the estimated centroid; return the least loss (dB) by the
+    wrong one, the largest by the estimated one, and estimated centroids (Hz) and squints (deg).
+    """
+    found = [DopplerCentroid(RADAR)(strip.recording.signal) for strip in strips]
+    centroids = [float(one["doppler_hz"]) for one in found]
+    pairs = [
+        [_focused(strip.recording.signal, hz) for hz in (wrong_hz, right_hz)]
+        for strip, right_hz in zip(strips, centroids, strict=True)
+    ]
+    plot.save(plot.images(dict(zip(names, pairs[0], strict=True)), 40, percentile=100), path)
+    losses = [[strip.loss_db(image) for image in pair] for strip, pair in zip(strips, pairs, strict=True)]
+    squints = [float(one["squint_deg"]) for one in found]
+    return min(one for one, _ in losses), max(abs(one) for _, one in losses), centroids, squints
 
 
 def _figure_6(strips: list[_Strip], path: Path) -> list[Check]:
-    lost, kept, off = [], [], []
-    for strip in reversed(strips):
-        doppler = float(DopplerCentroid(RADAR)(strip.recording.signal)["doppler_hz"])
-        images = {
-            "centroid ignored": _focused(strip.recording.signal, 0.0),
-            "estimated": _focused(strip.recording.signal, doppler),
-        }
-        for losses, image in zip((lost, kept), images.values(), strict=True):
-            losses.append(strip.loss_db(image))
-        off.append(abs(doppler - WRAPPED_HZ))
-    plot.save(plot.images(images, 40, percentile=100), path)
+    lost, kept, centroids, _ = _lost(strips, 0.0, ("centroid ignored", "estimated"), path)
+    off = max(abs(hz - WRAPPED_HZ) for hz in centroids)
     ours = (
-        f"peak {min(lost):.1f} dB lower or more without, {max(map(abs, kept)):.2f} dB or less with the centroid, which "
-        f"is {max(off):.2f} Hz off or less"
+        f"peak {lost:.1f} dB lower or more without, {kept:.2f} dB or less with the centroid, {off:.2f} Hz off or less"
     )
-    holds = min(lost) > 3 and max(map(abs, kept)) < 0.1
-    return [statement("centroid", "ignored, it displaces and blurs targets", holds, ours, len(strips))]
+    claim = "ignored, it displaces and blurs targets"
+    return [statement("centroid", claim, lost > 3 and kept < 0.1, ours, len(strips))]
 
 
 def _figure_7(strips: list[_Strip], path: Path) -> list[Check]:
+    lost, kept, _, squints = _lost(strips, DOPPLER_HZ - RADAR.prf_hz, ("a pulse rate off", "squint found"), path)
     true = math.degrees(math.asin(DOPPLER_HZ * RADAR.wavelength_m / (2 * RADAR.velocity_m_s)))
-    without, with_, off = [], [], []
-    for strip in reversed(strips):
-        found = DopplerCentroid(RADAR)(strip.recording.signal)
-        wrong = _focused(strip.recording.signal, DOPPLER_HZ - RADAR.prf_hz)
-        right = _focused(strip.recording.signal, float(found["doppler_hz"]))
-        without.append(strip.loss_db(wrong))
-        with_.append(strip.loss_db(right))
-        off.append(abs(float(found["squint_deg"]) - true))
-    plot.save(plot.images({"squint found": right, "a pulse rate off": wrong}, 40, percentile=100), path)
-    ours = f"peak {min(without):.1f} dB lower or more without the squint, {max(with_):.2f} dB or less with it"
+    ours = f"peak {lost:.1f} dB lower or more without the squint, {kept:.2f} dB or less with it"
     claim = "ignored, it smears bright targets to clouds"
     return [
-        statement("squint", claim, min(without) > 10, ours, len(strips)),
-        number("error of the squint (deg)", 0.01, off, 0.005, "lower"),
+        statement("squint", claim, lost > 10, ours, len(strips)),
+        number("error of the squint (deg)", 0.01, [abs(one - true) for one in squints], 0.005, "lower"),
     ]
 
 

@@ -34,7 +34,7 @@ TRUE_K = torch.tensor(WARP_K, dtype=torch.float64)
 PLACES_M, RANGE_M = (-12.0, 0.0, 12.0), 12.0
 CELLS_M = (3.4, 6.0, 12.0)  # ranges of the single cells of figure 1
 FINE = 16  # lines of a profile per Doppler cell
-REACH_M = 5.0  # to either side of a point, for the figures of its profile
+REACH_M = 5.0  # to either side of a point, for the peak of its profile
 # of a fit of second order to the phase by least squares; least entropy gives 20.05
 SECOND_K1 = 20.8
 NAMES = {
@@ -71,30 +71,6 @@ class _Profile:
     def near(self, centre_m: float, reach_m: float) -> _Profile:
         inside = (self.cross_range_m - centre_m).abs() <= reach_m
         return _Profile(self.cross_range_m[inside], self.amplitude[inside])
-
-    def figures(self) -> tuple[float, float, float]:
-        """Peak (dB), width (mm) where it has fallen by 3 dB, highest side lobe (dB)."""
-        a, peak = self.amplitude, int(self.amplitude.argmax())
-        width = float(_fall(a, peak, 1) + _fall(a, peak, -1)) * float(self.cross_range_m[1] - self.cross_range_m[0])
-        first, last = _foot(a, peak, -1), _foot(a, peak, 1)
-        rest = torch.cat([a[:first], a[last + 1 :]])
-        return 20 * math.log10(a[peak]), 1e3 * width, 20 * math.log10(rest.max() / a[peak])
-
-
-def _fall(a: Tensor, index: int, side: int) -> float:
-    """How many samples to one side of the peak the line falls by 3 dB."""
-    level, steps = float(a[index]) / math.sqrt(2), 1
-    while a[index + side * steps] > level:
-        steps += 1
-    before, here = float(a[index + side * (steps - 1)]), float(a[index + side * steps])
-    return steps - (level - here) / (before - here)
-
-
-def _foot(a: Tensor, index: int, side: int) -> int:
-    """The first minimum to one side."""
-    while 0 < index < len(a) - 1 and a[index + side] < a[index]:
-        index += side
-    return index
 
 
 def _compensated(signal: Signal, radar: InverseRadar) -> dict[str, _Profile]:
@@ -163,12 +139,6 @@ def _points(small: bool) -> dict[str, _Profile]:
     return _compensated(simulate_turntable(radar, world, 20000, 8, Draws(1))[0].signal, radar)
 
 
-def _seen_at(profiles: Mapping[str, _Profile], name: str, x_m: float) -> tuple[float, str]:
-    """Peak (dB) of a point, and its numbers in words."""
-    peak, width, side = profiles[name].near(x_m, REACH_M).figures()
-    return peak, f"{NAMES[name]}: peak {peak:.1f} dB, width {width:.2f} mm, side lobe {side:.1f} dB"
-
-
 def _shown(names: Sequence[str], reach_m: Sequence[float]) -> Callable[[dict[str, _Profile], Path], list[Check]]:
     """Figure 2 or 3: peaks of the outer and of the middle point rise with every compensation."""
 
@@ -176,10 +146,11 @@ def _shown(names: Sequence[str], reach_m: Sequence[float]) -> Callable[[dict[str
         _draw_profiles(profiles, names, reach_m, path)
         checks = []
         for x in (PLACES_M[-1], PLACES_M[1]):
-            peaks, words = zip(*(_seen_at(profiles, name, x) for name in names), strict=True)
-            rising = list(peaks) == sorted(peaks) and abs(peaks[-1]) < 0.1
+            peaks = [20 * math.log10(profiles[name].near(x, REACH_M).amplitude.max()) for name in names]
+            rising = peaks == sorted(peaks) and abs(peaks[-1]) < 0.1
             claim = "focused best by the last of the compensations"
-            checks.append(statement(f"point at {x:g} m", claim, rising, "; ".join(words)))
+            words = "; ".join(f"{NAMES[name]}: peak {peak:.1f} dB" for name, peak in zip(names, peaks, strict=True))
+            checks.append(statement(f"point at {x:g} m", claim, rising, words))
         return checks
 
     return make
