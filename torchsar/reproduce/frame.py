@@ -40,11 +40,6 @@ SENSOR = StripmapRadar(
 DWELL_S, RANGE_M, APERTURE_M, HALF_FRAME_M = 1.5, 700e3, 7000.0 * 1.5, 5000.0
 # lines and samples of frame and aperture or pulse, in the full and the reduced form
 SIZES = {False: (11_720, 17_500), True: (7_000, 1_400)}
-# range samples about the middle from which Doppler centroid and velocity are estimated, those that
-# hold the echo of a point, and those from one point to the next
-GROUP, SLAB, STEP = 1024, 1024, 4096
-# true over nominal velocity (m/s)
-OFF_M_S = 2.0
 
 
 class _Frame(NamedTuple):
@@ -60,27 +55,30 @@ class _Frame(NamedTuple):
     samples: int
 
 
-def _raw(lines: int, samples: int) -> Signal:
-    """Points are added to the noise slab by slab, which keeps the memory low."""
+def _raw(lines: int, samples: int, off_m_s: float, slab: int = 1024, step: int = 4096) -> Signal:
+    """Points, step range samples apart, are added to the noise in slabs that hold the echo of one,
+    which keeps the memory low. off_m_s: true over nominal velocity.
+    """
     axes = SENSOR.raw_axes(lines, samples)
     noise = torch.Generator().manual_seed(1)
     data = torch.empty((lines, samples), dtype=torch.complex64)
     torch.view_as_real(data).normal_(generator=noise)
     along = (lines / SENSOR.prf_hz - DWELL_S) * SENSOR.velocity_m_s * 0.45
     points = Points([-along, 0.0, along], [0.0] * 3, [3.0] * 3)
-    world = StripmapWorld(points, Dwell(DWELL_S), velocity_m_s=SENSOR.velocity_m_s + OFF_M_S)
-    for first in range((samples - SLAB) % STEP // 2, samples - SLAB + 1, STEP):
+    world = StripmapWorld(points, Dwell(DWELL_S), velocity_m_s=SENSOR.velocity_m_s + off_m_s)
+    for first in range((samples - slab) % step // 2, samples - slab + 1, step):
         radar = replace(SENSOR, near_range_m=SENSOR.near_range_m + first * SENSOR.range_step_m)
-        data[:, first : first + SLAB] += simulate(radar, world, lines, SLAB, Draws(1))[0].signal.data
+        data[:, first : first + slab] += simulate(radar, world, lines, slab, Draws(1))[0].signal.data
     return Signal(data, axes)
 
 
-def _frame(small: bool) -> _Frame:
+def _frame(small: bool, off_m_s: float = 2.0, width: int = 1024) -> _Frame:
+    """Doppler centroid and velocity are estimated from this many range samples in the middle."""
     lines, samples = SIZES[small]
-    raw = _raw(lines, samples)
+    raw = _raw(lines, samples, off_m_s)
     focus, doppler = OmegaK(SENSOR), DopplerCentroid(SENSOR)
-    near = max(0, (samples - GROUP) // 2)
-    group = raw.isel(range=slice(near, near + GROUP))
+    near = max(0, (samples - width) // 2)
+    group = raw.isel(range=slice(near, near + width))
     velocity = EffectiveVelocity(OmegaK(replace(SENSOR, near_range_m=group.axes[-1].start)), reach_m_s=20.0)
     began = time.process_time(), time.perf_counter()
     log.info("frame: Doppler centroid")
@@ -93,7 +91,7 @@ def _frame(small: bool) -> _Frame:
     amplitude = Detect()(image)
     spent = time.process_time() - began[0], time.perf_counter() - began[1]
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
-    off = float(speed) - SENSOR.velocity_m_s - OFF_M_S
+    off = float(speed) - SENSOR.velocity_m_s - off_m_s
     return _Frame(*spent, torch.get_num_threads(), peak, off, amplitude.data.numel())
 
 

@@ -18,6 +18,19 @@ KINDS = ("figure", "table", "text", "erratum", "diagram", "photograph", "unpubli
 SHOWN = ("diagram", "photograph", "unpublished")
 
 
+def seeds_of(small: bool, draws: int = 5) -> range:
+    """Return the seeds of the random draws behind a verdict.
+
+    Args:
+        small: Whether it is the reduced form, with one draw.
+        draws: Number of draws of the full form.
+
+    Returns:
+        The seeds.
+    """
+    return range(1, 2 if small else 1 + draws)
+
+
 @dataclass(frozen=True)
 class Check:
     """One published number or statement beside ours.
@@ -173,7 +186,7 @@ def falling(name: str, values: Mapping[str, float | Sequence[float]], rising: bo
     ours = [sum(row) / len(row) for row in rows.values()]
     holds = ours == sorted(ours, reverse=not rising)
     listed = "; ".join(f"{method} {value:.4g}" for method, value in zip(rows, ours, strict=True))
-    draws = max(map(len, rows.values()))
+    draws = max((len(value) for value in values.values() if isinstance(value, Sequence)), default=None)
     return statement(name, f"{'rises' if rising else 'falls'} in the order: {'; '.join(values)}", holds, listed, draws)
 
 

@@ -26,7 +26,7 @@ from torchsar.radar import LinearFM, StripmapRadar
 from torchsar.repair import CorrectJitter, CorrectResponse, EstimateResponse, PilotJitter
 from torchsar.repair.contamination import find_contamination
 from torchsar.reproduce import frame
-from torchsar.reproduce.item import Check, Item, Paper, in_order, number, statement
+from torchsar.reproduce.item import Check, Item, Paper, in_order, number, seeds_of, statement
 from torchsar.scene import Dwell, Points, StripmapWorld
 
 __all__ = ["PAPER"]
@@ -51,8 +51,8 @@ JITTER = PeriodicJitter((-0.0325, 0.1475, -0.1525, 0.0375))
 TONE = Tone(20.0, 31e6, drift_hz=2e6, share=0.05)
 # centroid (Hz) of figure 6, with a part of the Doppler band beyond half the pulse rate
 WRAPPED_HZ = 950.0
-# points and blocks of lines of figure 5, and draws in the full form
-MANY, BLOCKS, DRAWS = 300, 16, 5
+# points and blocks of lines of figure 5
+MANY, BLOCKS = 300, 16
 
 
 def _response_rad(u: Tensor) -> Tensor:
@@ -97,19 +97,15 @@ def _simulated(targets: Points, doppler_hz: float, seed: int) -> Recording:
     return simulate(RADAR, world, LINES, SAMPLES, Draws(seed))[0]
 
 
-def _seeds(small: bool) -> range:
-    return range(1, 2 if small else DRAWS + 1)
-
-
 def _strips(small: bool, doppler_hz: float = DOPPLER_HZ) -> list[_Strip]:
-    recordings = {seed: _simulated(POINTS, doppler_hz, seed) for seed in _seeds(small)}
+    recordings = {seed: _simulated(POINTS, doppler_hz, seed) for seed in seeds_of(small)}
     return [_Strip(one, _focused(one.signal, doppler_hz), seed) for seed, one in recordings.items()]
 
 
 def _uneven(small: bool) -> list[Recording]:
     """Points at random places, wherever the beam looks."""
     recordings = []
-    for seed in _seeds(small):
+    for seed in seeds_of(small):
         draws = Draws(seed)
         azimuth, range_ = (w * draws.uniform(name, (MANY,)) for name, w in (("along", 5400.0), ("across", 300.0)))
         level = draws.uniform("level", (MANY,)) ** 4

@@ -42,7 +42,6 @@ TRUE_M_S, GUESSES_M_S = 10.0, (5.0, 8.0, 10.0)
 Closing = tuple[dict[str, Signal], Tensor]
 # level (dB) below which the text says that false targets are
 PUBLISHED_MFTA = {"band-limited": -60.0, "pattern": -25.0}
-TABLE_4_MFTA = -47.56  # largest in Table 4, by the method with three bands
 
 
 # reconstruction of the bands, and whether the velocity of the target is used, or zero in its place
@@ -182,14 +181,15 @@ def _figure_17(seen: tuple[Tensor, dict[str, dict[str, Tensor]]], path: Path) ->
         "band-limited": ("proposed, N = 3", "proposed, N = 2"),
         "pattern": ("proposed, N = 3", "proposed, MMSE, N = 5"),
     }
+    table_4_db = -47.56  # the largest there, by the method with three bands
     checks = []
     for gate, methods in shown.items():
         for method in methods:
             level, worst = PUBLISHED_MFTA[gate], float(found[gate][method].max())
             ours, claim = f"at most {worst:.1f} dB", f"below {level:g} dB at all speeds"
             if (gate, method) == ("band-limited", "proposed, N = 3"):
-                ours = f"{ours}; Table 4 of the paper prints {TABLE_4_MFTA:g} dB"
-                checks.append(misprint(f"{gate}, {method}", claim, worst > level and level < TABLE_4_MFTA, ours))
+                ours = f"{ours}; Table 4 of the paper prints {table_4_db:g} dB"
+                checks.append(misprint(f"{gate}, {method}", claim, worst > level and level < table_4_db, ours))
             else:
                 checks.append(statement(f"{gate}, {method}", claim, worst < level, ours))
     return checks

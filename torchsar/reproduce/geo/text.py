@@ -17,9 +17,15 @@ from torchsar.reproduce.item import Check, Item, given, misprint, number, statem
 # from the receiver (m) with their along-track speeds (m/s)
 PRINTED_K2 = 0.03
 SHIPS = {"ship 2": (6490.0, 0.0, 934.58, 216.3), "ship 3": (4860.0, 10.0, 723.99, 167.6)}
-HALF_S, V = INTEGRATION_S / 2, RADAR.speed_m_s
-DELAY_S = (RADAR.channel_m[1] - RADAR.channel_m[0]) / V
-RECEIVER_HZ = V**2 * INTEGRATION_S / (RADAR.wavelength_m * RADAR.reference_range_m)
+
+
+def _receiver_hz() -> float:
+    return RADAR.speed_m_s**2 * INTEGRATION_S / (RADAR.wavelength_m * RADAR.reference_range_m)
+
+
+def _delay_s() -> float:
+    """Of a channel against its neighbour."""
+    return (RADAR.channel_m[1] - RADAR.channel_m[0]) / RADAR.speed_m_s
 
 
 def _orbit(small: bool) -> list[float]:
@@ -31,7 +37,7 @@ def _orbit(small: bool) -> list[float]:
 
 
 def _higher_terms(k: list[float], path: Path) -> list[Check]:
-    phase = 2 / RADAR.wavelength_m * sum(k[i] * HALF_S ** (i + 1) for i in (2, 3))
+    phase = 2 / RADAR.wavelength_m * sum(k[i] * (INTEGRATION_S / 2) ** (i + 1) for i in (2, 3))
     claim = "below 1e-4 pi within the integration time"
     return [statement("phase of the third and the fourth term", claim, phase < 1e-4, f"{phase:.2g} pi")]
 
@@ -56,7 +62,7 @@ def _scnr(seen: Columns, path: Path) -> list[Check]:
 
 
 def _ship(name: str, range_m: float, u_a: float, distance_m: float, shift_m: float) -> list[Check]:
-    along = V - u_a
+    along = RADAR.speed_m_s - u_a
     return [
         number(f"{name}: distance of the false target (m)", distance_m, RADAR.prf_hz * 0.24 * range_m / along, 0.1),
         number(f"{name}: displacement (m)", shift_m, TRUE_M_S * range_m / along, 0.1),
@@ -64,8 +70,8 @@ def _ship(name: str, range_m: float, u_a: float, distance_m: float, shift_m: flo
 
 
 def _equation_30() -> Check:
-    range_m, u_a, _, printed = SHIPS["ship 3"]
-    by_equation, by_speed = V * TRUE_M_S * range_m / (V - u_a) ** 2, TRUE_M_S * range_m / (V - u_a)
+    (range_m, u_a, _, printed), v = SHIPS["ship 3"], RADAR.speed_m_s
+    by_equation, by_speed = v * TRUE_M_S * range_m / (v - u_a) ** 2, TRUE_M_S * range_m / (v - u_a)
     shown = abs(by_speed - printed) < 0.1 < abs(by_equation - printed)
     ours = f"{by_equation:.1f} m by the equation, {by_speed:.1f} m by u_r R0 / (v_R - u_a)"
     return misprint("displacement of ship 3 by Eq. (30)", f"{printed:g} m", shown, ours)
@@ -88,8 +94,8 @@ def _table_3() -> Check:
 
 
 def _equation_13() -> Check:
-    second = 2 * PRINTED_K2 * DELAY_S * HALF_S
-    at_s = 1.6e-3 / (2 * PRINTED_K2 * DELAY_S)
+    second = PRINTED_K2 * _delay_s() * INTEGRATION_S
+    at_s = 1.6e-3 / (2 * PRINTED_K2 * _delay_s())
     ours = f"{second:.1e} m at the ends of the integration time; 1.6e-3 m needs {at_s:.0f} s"
     return misprint("second term of the range error, Eq. (13)", "1.6e-3 m", second < 0.5e-3, ours)
 
@@ -98,14 +104,14 @@ ITEMS = (
     given(
         "Text 1",
         "Doppler bandwidth (section 2.3)",
-        number("of the receiver (Hz)", 337.5, RECEIVER_HZ, 0.1),
-        number("of receiver and transmitter (Hz)", 338.6, RECEIVER_HZ + 2 * PRINTED_K2 * INTEGRATION_S / 0.24, 0.1),
+        number("of the receiver (Hz)", 337.5, _receiver_hz(), 0.1),
+        number("of receiver and transmitter (Hz)", 338.6, _receiver_hz() + 2 * PRINTED_K2 * INTEGRATION_S / 0.24, 0.1),
     ),
     Item("Text 2", "neglected terms of the transmit range (section 2.1)", _orbit, _higher_terms),
     given(
         "Text 3",
         "third term of the range error between channels (section 2.1)",
-        number("largest value (1e-7 m)", 2.1, 1e7 * PRINTED_K2 * DELAY_S**2, 0.05),
+        number("largest value (1e-7 m)", 2.1, 1e7 * PRINTED_K2 * _delay_s() ** 2, 0.05),
     ),
     given(
         "Text 4",

@@ -34,7 +34,7 @@ from torchsar.metrics import entropy, impulse_response
 from torchsar.radar import InverseRadar
 from torchsar.reproduce.isal_rotation.common import focused, in_metres, known_of, ladar, second_order
 from torchsar.reproduce.isal_rotation.profiles import OMEGA_RAD_S, WARP_K
-from torchsar.reproduce.item import Check, Item, falling, misprint, number, statement
+from torchsar.reproduce.item import Check, Item, falling, misprint, number, seeds_of, statement
 from torchsar.scene import PolynomialRotation, Satellite, TurntableWorld
 
 ROTATION = PolynomialRotation(OMEGA_RAD_S, WARP_K)
@@ -43,8 +43,8 @@ TIP_M = 6.43
 # chosen: pulse rate, pulses, cells, cell size, scatterers, chirplets, in the full and reduced forms
 SIZES = {False: (500e3, 10000, 32, 0.24, 300, 16), True: (50e3, 1000, 32, 0.24, 60, 4)}
 SNR_DB = 20.0
-# scenes in the full form, and lines per Doppler cell of the images of Newton's method
-SCENES, LINES_PER_CELL = 5, 8.0
+# lines per Doppler cell of the images of Newton's method
+LINES_PER_CELL = 8.0
 # estimates of the genetic algorithm in the text (rad/s, 1/s, 1/s2), and tolerances
 PUBLISHED = {
     "omega_rad_s": (0.0202, 0.0004),
@@ -105,18 +105,6 @@ def simulated(small: bool, seed: int) -> tuple[Signal, Truth, InverseRadar]:
 
 def _satellite(small: bool) -> list[_Imaged]:
     return [_imaged(small, seed) for seed in seeds_of(small)]
-
-
-def seeds_of(small: bool) -> range:
-    """Return the seeds of the scenes.
-
-    Args:
-        small: Whether it is the reduced form, with one scene.
-
-    Returns:
-        The seeds.
-    """
-    return range(1, 2 if small else SCENES + 1)
 
 
 def _entropies(seen: list[_Imaged], *names: str) -> dict[str, list[float]]:

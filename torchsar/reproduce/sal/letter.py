@@ -16,7 +16,7 @@ from torchsar.compensate import SegmentedInterference, SpectrumCorrelation
 from torchsar.core import Draws, Signal, Stage, Trace
 from torchsar.echo import simulate_ladar
 from torchsar.metrics import contrast, entropy
-from torchsar.reproduce.item import Check, Item, falling, number
+from torchsar.reproduce.item import Check, Item, falling, number, seeds_of
 from torchsar.reproduce.sal.points import MOTION, RADAR, methods
 from torchsar.scene import LadarWorld, LetterE, QuadraticInSweep
 from torchsar.study.systems.sal.figures import in_milliseconds
@@ -24,8 +24,6 @@ from torchsar.study.systems.sal.judge import course_of, finer_in_range
 
 # relative ranges of the letter (m), and SNR (dB) per sample before compression of one point
 SCENE_M, SNR_DB = (-1.5, 1.5), 20.0
-# draws of phases and noise in the full form
-DRAWS = 5
 # in the order of the columns of Table 3: entropies fall and contrasts rise along it
 SHOWN = ("uncompensated", "cross-correlation", "segmented, summed")
 
@@ -38,7 +36,7 @@ def _letter(small: bool) -> tuple[Traces, Rows]:
     """What every method made of the first draw, and by method the entropies (nats), contrasts of
     the amplitude and residuals (rad) of all draws.
     """
-    runs = [_run(256 if small else 512, seed) for seed in range(1, 2 if small else 1 + DRAWS)]
+    runs = [_run(256 if small else 512, seed) for seed in seeds_of(small)]
     numbers = {name: zip(*(of[name] for _, of in runs), strict=True) for name in runs[0][1]}
     return runs[0][0], {name: [list(each) for each in of] for name, of in numbers.items()}
 
