@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -214,3 +215,30 @@ def joined(real: np.ndarray, imag: np.ndarray) -> np.ndarray:
     samples = np.empty(real.shape, complex_type(np.result_type(real, imag)))
     samples.real, samples.imag = real, imag
     return samples
+
+
+class Level:
+    """Mean and deviation of samples that come in blocks, by which an offset is noticed."""
+
+    def __init__(self) -> None:
+        self._moments = np.zeros(4)
+
+    def add(self, samples: np.ndarray) -> None:
+        """Count a block of complex samples."""
+        i, q = (part.astype(np.float64) for part in (np.real(samples), np.imag(samples)))
+        self._moments += np.array([i.size, i.sum(), q.sum(), np.vdot(i, i) + np.vdot(q, q)])
+
+    def warn(self, what: str, key: str) -> None:
+        """Warn of a mean above half the deviation, which receivers do not have; the key names what
+        removes it.
+        """
+        n, *sums, square = self._moments.tolist()
+        i, q = (x / n for x in sums)
+        deviation = math.sqrt(max(square / n - i**2 - q**2, 0) / 2)
+        if max(abs(i), abs(q)) > deviation / 2:
+            warnings.warn(
+                f"{what}: samples have a mean of I {i:.4g} and Q {q:.4g} and a standard deviation of {deviation:.3g}; "
+                f"if this is the offset of numbers without sign, give its exact value, about {(i + q) / 2:.3g}, as "
+                f"{key}",
+                stacklevel=2,
+            )

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 import torch
 
 from torchsar.core import Recording, StoredArray
-from torchsar.io.fields import Described, joined, naming, number, read_described, refuse_missing
+from torchsar.io.fields import Described, Level, joined, naming, number, read_described, refuse_missing, shown
 from torchsar.radar import LIGHT_M_S, LinearFM, StripmapRadar
 
 # keys of the archive: samples, then numbers
@@ -50,10 +51,16 @@ def read_stripmap(path: str | Path, dtype: torch.dtype = torch.complex64) -> Rec
     - `chirp_rate_hz_s`, `pulse_s`: chirp rate, negative for a down-chirp, and pulse length.
     - `slant_range_cell1_m`: slant range of a target whose echo begins at range cell 1.
     - `v_eff_m_s`: nominal effective velocity.
-    It may hold `first_cell` (range cell of the first sample, counted from 1, by default 1), `c_m_s`
-    (speed of light), `agc_db` (line,) (attenuation of the receiver in dB, which is compensated
-    here), `line_number` (line,) and `pilot` (sample,), a recorded pilot tone. Other keys are
-    ignored, including the Doppler ambiguity number, which is estimated from the data.
+    It may hold these:
+    - `offset`: a number, or one for I and Q, that samples exceed their true values by and that is
+      subtracted, such as 127.5 of bytes without sign.
+    - `first_cell`: range cell of the first sample, counted from 1, by default 1.
+    - `c_m_s`: speed of light.
+    - `agc_db` (line,): attenuation of the receiver in dB, which is compensated here.
+    - `line_number` (line,).
+    - `pilot` (sample,): a recorded pilot tone.
+    Other keys are ignored, including the Doppler ambiguity number, which is estimated from the
+    data. Samples whose mean exceeds half their standard deviation cause a UserWarning.
 
     Args:
         path: Path of the archive.
@@ -68,7 +75,11 @@ def read_stripmap(path: str | Path, dtype: torch.dtype = torch.complex64) -> Rec
         ValueError: If the file is not such an archive, a key is missing or invalid, or a number is
             far from those of any recording.
     """
-    return read_described(path, dtype, "raw stripmap data", describe_stripmap)
+    recording = read_described(path, dtype, "raw stripmap data", describe_stripmap)
+    level = Level()
+    level.add(recording.signal.data.numpy())
+    level.warn(str(path), "offset")
+    return recording
 
 
 def describe_stripmap(fields: Mapping[str, StoredArray], path: Path) -> Described:
@@ -109,12 +120,25 @@ def describe_stripmap(fields: Mapping[str, StoredArray], path: Path) -> Describe
             wave_speed_m_s=c,
         )
         aux: dict[str, Any] = {name: _side(fields[name], name, iq) for name in _AUX if name in fields}
-    return Described(iq, radar, aux, _samples)
+    return Described(iq, radar, aux, partial(_samples, offset=_offset(fields)))
 
 
-def _samples(iq: np.ndarray) -> np.ndarray:
-    """Complex samples (line, sample) of complex ones, or of I and Q."""
-    return iq if iq.ndim == 2 else joined(iq[..., 0], iq[..., 1])
+def _samples(iq: np.ndarray, offset: complex) -> np.ndarray:
+    """Complex samples (line, sample) of complex ones, or of I and Q, without their offset."""
+    data = iq if iq.ndim == 2 else joined(iq[..., 0], iq[..., 1])
+    return data - offset if offset else data
+
+
+def _offset(fields: Mapping[str, StoredArray]) -> complex:
+    """What samples exceed their true values by."""
+    if "offset" not in fields:
+        return 0
+    both = np.broadcast_to(fields["offset"].load("iuf"), 2) if fields["offset"].shape in ((), (1,), (2,)) else None
+    if both is None or not np.isfinite(both).all():
+        raise ValueError(
+            f"{fields['offset'].what} must be one finite number, or one for I and Q, got {shown(fields['offset'])}"
+        )
+    return complex(*both.tolist())
 
 
 def _refuse_implausible(numbers: Mapping[str, float], c: float) -> None:

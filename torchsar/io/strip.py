@@ -14,7 +14,7 @@ from torchsar.core import Axis, Recording, Signal
 from torchsar.focus.detection import QuickLook
 from torchsar.io.arrays import put
 from torchsar.io.extras import library, reading
-from torchsar.io.fields import archive, naming
+from torchsar.io.fields import Level, archive, naming
 from torchsar.io.recorded import describe_stripmap
 from torchsar.io.seal import canonical, group_attributes, sealed
 
@@ -56,7 +56,9 @@ class StripRecording:
                 raise ValueError(
                     f"{path}: {name} must have one entry per line, {self.shape[0]}, got {found.aux[name].shape}"
                 )
-        found.samples.rows(0, 1)
+        level = Level()
+        level.add(found.formed(found.samples.rows(0, min(self.shape[0], 64))))  # pyright: ignore[reportArgumentType]
+        level.warn(str(path), "offset")
 
     def recording(self, first: int, last: int) -> Recording:
         """Read some of the lines.
