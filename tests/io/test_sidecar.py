@@ -349,7 +349,7 @@ MISTAKES: dict[str, tuple[dict[str, Any], list[str]]] = {
     "a wrong order": ({"samples.order": "iqq"}, ["order must have as many i as q", "'iqq'"]),
     "an order without pairs": (
         {"samples.order": "iiqqiq", "samples.dims": ["pulse", "range", "iq"]},
-        ["multiple of 3"],
+        ["order must have as many i as q", "divides that of the samples, 40, got 'iiqqiq'"],
     ),
     "an offset": ({"samples.offset": [1.0, 2.0, 3.0]}, ["offset must be a number", "[1.0, 2.0, 3.0]"]),
     "imag beside iq": ({"samples.imag": "iq/data"}, ["samples must be complex, or real with one dim iq or one array"]),

@@ -39,6 +39,8 @@ REASONS: dict[str, str] = {
     "core.gathered_checks": "takes no arguments; tests/core/test_host.py",
     "core.real_dtype": "takes a dtype only",
     "radar.geometry_of": "builds a geometry, whose classes check their fields; tests/focus/test_spotlight.py",
+    "io.fmcw_recording": "makes a whole recording; tests/io/test_fmcw.py",
+    "repair.regular_lines": "takes a whole recording; tests/repair/test_placing.py",
     "radar.read_track": "reads a file; tests/radar/test_track.py",
     "io.import_recording": "reads and writes files; tests/io/test_sidecar.py",
     "io.read_images": "reads a file; tests/io/test_export.py",

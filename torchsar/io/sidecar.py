@@ -23,7 +23,7 @@ import torch
 from torchsar.core import Recording, StoredArray
 from torchsar.io.containers import BlockArray, Container, flat_array, open_container
 from torchsar.io.extras import write_whole
-from torchsar.io.fields import Described, Level, complex_type, joined, naming
+from torchsar.io.fields import Described, Level, complex_type, joined, naming, parted
 from torchsar.io.inverse import describe_inverse
 from torchsar.io.path import describe_path
 from torchsar.io.recorded import describe_stripmap
@@ -53,7 +53,10 @@ _KINDS = {
             **{"fs_hz": "Hz", "prf_hz": "Hz", "f0_hz": "Hz", "chirp_rate_hz_s": "Hz/s", "pulse_s": "s"},
             **{"slant_range_cell1_m": "m", "v_eff_m_s": "m/s", "first_cell": "", "c_m_s": "m/s"},
         },
-        {"agc_db": ("dB", "pulse"), "line_number": ("", "pulse"), "pilot": ("", "range")},
+        {
+            **{"agc_db": ("dB", "pulse"), "line_number": ("", "pulse"), "line_time_s": ("s", "pulse")},
+            "pilot": ("", "range"),
+        },
         describe_stripmap,
     ),
     "profiles": _Kind(
@@ -306,27 +309,17 @@ def _order(
     tree: Mapping[str, Any], where: str, dims: list[str], shape: Mapping[str, int], slow: str
 ) -> Callable[[np.ndarray], Sequence[np.ndarray]]:
     """The function that parts I and Q, by the order in which they follow each other."""
-    group = tree.get("order", "iq").lower()
-    i, q = ([at for at, one in enumerate(group) if one == kind] for kind in "iq")
-    if not i or len(i) != len(q) or len(i) + len(q) != len(group) or ("order" in tree and "iq" not in dims):
-        raise ValueError(
-            f"{where}.order must have as many i as q, such as iq, qi or iiqq, for samples with a dim iq, got "
-            f"{tree['order']!r} with the dims {dims}"
-        )
-    if len(i) == 1:
-        return lambda x: [x.take(place[0], dims.index("iq")) for place in (i, q)]
-    before = dims[-2]
-    if dims[-1] != "iq" or before == slow or before in tree.get("choose", {}) or shape[before] % len(i):
-        raise ValueError(
-            f"{where}.order {group!r} needs iq as the last dim, after the fast one, whose length is a multiple of "
-            f"{len(i)}, got the dims {dict(shape)}"
-        )
-
-    def parted(x: np.ndarray) -> list[np.ndarray]:
-        groups = x.reshape(*x.shape[:-2], -1, len(group))
-        return [groups[..., place].reshape(x.shape[:-1]) for place in (i, q)]
-
-    return parted
+    order = tree.get("order", "iq")
+    if "iq" not in dims and "order" in tree:
+        raise ValueError(f"{where}.order is for samples with a dim iq, got the dims {dims}")
+    if len(order) == 2 and "iq" in dims:
+        return lambda x: parted(np.moveaxis(x, dims.index("iq"), -1), order)
+    before = dims[-2] if len(dims) > 1 else ""
+    if "order" in tree and (dims[-1] != "iq" or before == slow or before in tree.get("choose", {})):
+        raise ValueError(f"{where}.order {order!r} needs iq as the last dim, after the fast one, got {dict(shape)}")
+    with naming(f"{where}.order"):
+        parted(np.empty((shape[before], 2)), order)
+    return lambda x: parted(x, order)
 
 
 def _offset(tree: Mapping[str, Any], where: str) -> complex:

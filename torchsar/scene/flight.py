@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -129,12 +129,17 @@ class RecordedPath(NominalPath):
             first record.
 
     Raises:
+        TypeError: If there is no track.
         ValueError: From `position_m`, if pulses lie beyond the log, or it has gaps or jumps, see
             `resample_path`.
     """
 
-    track: Track
+    track: Any  # a Track, which all trials share
     start_s: float | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.track, Track):
+            raise TypeError(f"a RecordedPath needs a Track, as radar.read_track returns it, got {self.track!r:.80}")
 
     def position_m(self, time_s: Tensor) -> Tensor:
         clock, place = (x.to(time_s.device) for x in (self.track.time_s, self.track.position_m))
