@@ -99,6 +99,8 @@ class _Strip:
                 "cases; write data.file=PATH after the command"
             )
         self.recording = StripRecording(config.data.file, getattr(torch, config.precision))
+        for note in self.recording.notes:
+            log.warning("warning: %s: %s", config.data.file, note)
         chain = build_chains(loaded, radar=self.recording.radar)["recommended"].to(device)
         where, names = f"{loaded.file}: processor.recommended.stages", list(chain.stages)
         strips = [name for name in names if isinstance(chain.stages[name], FocusStrip)]

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import pytest
 import torch
 
 from tests.contract.pretended import DEVICE, pretended_device, to_device, to_host
 from tests.io.scenes import POINT, recorded
-from torchsar.core import Chain, use
-from torchsar.focus import SpotlightImage, TileImage
+from torchsar.core import Chain, Recording, Signal, use
+from torchsar.focus import DirectImage, SpotlightImage, TileImage
 from torchsar.focus.spotlight_image import scene_grid
-from torchsar.radar import LIGHT_M_S, AntennaPath
+from torchsar.radar import LIGHT_M_S, AntennaPath, InverseRadar, range_profiles
 
 RECORDED = {both: recorded(both) for both in (False, True)}
 
@@ -109,3 +110,84 @@ def test_other_data_are_refused(aux, match):
     trials = {name: value[None] for name, value in RECORDED[False].aux.items()}
     with pytest.raises(ValueError, match="must have no trials"):
         SpotlightImage(trials)
+
+
+def history_of(places: torch.Tensor, reference_m: float, points, frequency_hz: torch.Tensor) -> tuple[Signal, dict]:
+    """Range profiles of points, by the signal model, and their side data."""
+    path = AntennaPath(places, None, torch.full((len(places),), 2.0 * reference_m, dtype=torch.float64))
+    turns = path.path_m(torch.tensor(points, dtype=torch.float64))[..., None] * frequency_hz / LIGHT_M_S
+    history = torch.exp(-2j * torch.pi * turns).sum(1)
+    sensor = InverseRadar(float(frequency_hz.mean()), 1e9, 100.0)
+    signal = Recording.from_arrays(range_profiles(history), sensor).signal
+    return signal, {**path.side_data(), "frequency_hz": frequency_hz}
+
+
+def peak_of(image: Signal, near: tuple[float, float], stage: SpotlightImage) -> tuple[float, float]:
+    """Position (x, y) of the peak within half a metre of a point."""
+    away = torch.linalg.vector_norm(stage.grid.pixels_m()[..., :2] - torch.tensor(near, dtype=torch.float64), dim=-1)
+    at = int(torch.where(away < 0.5, image.data.abs(), 0).argmax())
+    x, y, _ = stage.grid.pixels_m().reshape(-1, 3)[at].tolist()
+    return x, y
+
+
+def rail(start, stop, n: int = 161) -> torch.Tensor:
+    share = torch.linspace(0, 1, n, dtype=torch.float64)[:, None]
+    return torch.tensor(start, dtype=torch.float64) * (1 - share) + torch.tensor(stop, dtype=torch.float64) * share
+
+
+WIDE_HZ = torch.linspace(3.1e9, 4.9e9, 128, dtype=torch.float64)  # a window of 10.6 m
+RAILS = {
+    "a rail through the origin": (rail([0.0, -3, 0], [0.0, 3, 0]), 9.0, [[9.4, 2.5, 0], [7.5, -2.4, 0]]),
+    "dechirped, without a reference": (rail([0.0, -2, 0], [0.0, 2, 0]), 0.0, [[8.0, 1.0, 0], [3.0, -0.5, 0]]),
+    "moved along -x": (rail([2.0, 5, 0], [-2.0, 5, 0]), 9.0, [[0.5, -4.0, 0]]),
+    "raised": (rail([0.0, -2, 3], [0.0, 2, 3]), 8.0, [[7.0, 1.0, 0]]),
+    "about the origin": (rail([-8.0, -3, 0], [-8.0, 3, 0]), 8.0, [[1.0, 2.0, 0]]),
+}
+
+
+@pytest.mark.parametrize("name", RAILS)
+def test_rails_and_near_fields(name):
+    places, reference_m, points = RAILS[name]
+    signal, aux = history_of(places, reference_m, points, WIDE_HZ)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        stage = SpotlightImage(aux, error_db=-40.0)
+    image = stage(signal)
+    for x, y, _ in points:
+        assert math.dist(peak_of(image, (x, y), stage), (x, y)) < 0.05
+    assert not stage.sampling_limits(antennas(aux), WIDE_HZ)
+    assert (name == "about the origin") == (not said), [str(one.message) for one in said]
+    if said:
+        assert "ground ranges from" in str(said[0].message) and "centre_m" in str(said[0].message)
+
+
+def test_a_centre_may_be_given():
+    places, reference_m, points = RAILS["a rail through the origin"]
+    signal, aux = history_of(places, reference_m, points, WIDE_HZ)
+    stage = SpotlightImage(aux, 2.0, 2.0, 0.04, centre_m=(9.0, 2.0))
+    assert math.dist(peak_of(stage(signal), (9.4, 2.5), stage), (9.4, 2.5)) < 0.05
+    assert stage.sampling_limits(antennas(aux), WIDE_HZ)
+
+
+@pytest.mark.parametrize("reference_m", [0.0, 4.0])
+def test_a_whole_circle(reference_m):
+    turn = torch.linspace(0, 2 * math.pi, 401, dtype=torch.float64)[:-1]
+    places = torch.stack([4 * torch.cos(turn), 4 * torch.sin(turn), 0 * turn], -1)
+    signal, aux = history_of(places, reference_m, [[0.5, -0.8, 0.0]], WIDE_HZ)
+    stage = SpotlightImage(aux, 3.0, 3.0, 0.02, window="none", error_db=-40.0)
+    image = stage(signal)
+    exact = DirectImage(3.0, 3.0, 0.02, window="none")
+    same = exact(signal, *(aux[key] for key in ("frequency_hz", "transmitter_m", "path_reference_m")))
+    assert float((image.data - same.data).abs().square().mean() / same.data.abs().square().mean()) < 1e-4
+    assert math.dist(peak_of(image, (0.5, -0.8), stage), (0.5, -0.8)) < 0.03
+
+
+def test_lost_pulses_are_named_and_do_not_crop_the_image():
+    aux = RECORDED[False].aux
+    kept = torch.arange(48) < 20
+    kept[34:] = True
+    some = AntennaPath(aux["transmitter_m"][kept], None, aux["path_reference_m"][kept])
+    wide = 1000 * torch.tensor([[-20.0, -4, 1], [10, -4, 1], [10, 8, 1], [-20, 8, 1]], dtype=torch.float64)
+    with pytest.warns(UserWarning, match=r"the largest step between pulses, at pulse 19, is 15.* times the median one"):
+        grid = scene_grid(aux["frequency_hz"], some, wide)
+    assert grid.azimuth_m == pytest.approx(scene_grid(aux["frequency_hz"], antennas(aux), wide).azimuth_m, rel=0.02)

@@ -183,3 +183,33 @@ def test_vectors_that_vary_are_read_or_refused(tmp_path, built, vectors, match):
 def test_channels_are_named(tmp_path):
     with pytest.raises(ValueError, match=r"has no channel 'HV'; it has \['main'\]"):
         read_cphd(Built().write(tmp_path / "a.cphd"), channel="HV")
+
+
+def test_vectors_without_numbers_are_named_and_left_out(tmp_path):
+    built = Built()
+    broken = built.vectors()["TxTime"].copy()
+    broken[7:10] = np.nan
+    with pytest.warns(UserWarning, match=r"lost.cphd: 3 of 48 vectors have no finite .* the first of them 7, 8, 9"):
+        recording = read_cphd(built.write(tmp_path / "lost.cphd", {"TxTime": broken}), torch.complex128)
+    assert len(recording.signal.data) == PULSES - 3
+    assert abs(complex(at(recording, POINTS)) - 1) < 1e-6
+
+
+def test_the_area_lies_in_the_plane_through_the_reference_point(tmp_path):
+    corners = read_cphd(Built().write(tmp_path / "a.cphd")).aux["scene_corners_m"]
+    assert (corners[:, 2] == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("start", "match"),
+    [
+        (b"<html><body>404", "begins with b'<html><body>404' instead of CPHD/ and a version, as a page of the web"),
+        (b"CPHD/0.3\nXML_DATA_SIZE := 1", r"its version is 0\.3, and 1\.0\.1 and 1\.1\.0 are read"),
+        (b"", "begins with b'' instead of CPHD/"),
+    ],
+)
+def test_other_files_are_named(tmp_path, start, match):
+    (tmp_path / "other.cphd").write_bytes(start)
+    with pytest.raises(ValueError, match=f"other.cphd cannot be read as CPHD: .*{match}") as error:
+        read_cphd(tmp_path / "other.cphd")
+    assert "\n" not in str(error.value)

@@ -184,7 +184,7 @@ WHOLE = packed(STRIPMAP)
 MISTAKEN: dict[str, tuple[bytes, str]] = {
     "empty": (b"", "is empty"),
     "cut off": (WHOLE[: len(WHOLE) // 2], "is cut off or damaged"),
-    "encrypted": (encrypted(WHOLE), "fs_hz is encrypted; save the archive without a password"),
+    "encrypted": (encrypted(WHOLE), "prf_hz is encrypted; save the archive without a password"),
     "a key twice": (doubled(WHOLE), "holds the array 'fs_hz' twice"),
     "one array": (as_npy(STRIPMAP["iq"]), "holds a single array"),
     "of another kind": (b"\x89HDF\r\n" + bytes(99), "is a file of another kind"),

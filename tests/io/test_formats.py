@@ -33,6 +33,7 @@ def test_archives_are_read_by_their_keys(tmp_path, members):
         ("a.xyz", b"nothing", r"is of no known format; files that can be read are .*CPHD \(.cphd\)"),
         ("a.xyz", b"", "is of no known format"),
         ("a.crsd", b"CRSDsar/1.0\n", "received signals before range compression"),
+        ("a.csv", b"t,x,y,z\n", "is a table of numbers, such as a motion log.*read_track"),
         ("a.npz", b"", "is empty"),
     ],
 )

@@ -112,3 +112,29 @@ def test_gotcha_by_tiles(recorded):
     azimuth, range_ = (axis.values() for axis in image.axes)
     i, j = divmod(int(image.data.abs().argmax()), len(range_))
     assert abs(float(range_[j]) + 15.5) <= 0.25 and abs(float(azimuth[i]) - 21.5) <= 0.25
+
+
+IMPLAUSIBLE = {
+    "GHz": (lambda a: {"freq_hz": a["freq_hz"] / 1e9}, "freq_hz is 9.03.* Hz in the middle.*if it is in GHz"),
+    "km": (
+        lambda a: {"transmitter_m": a["transmitter_m"] / 1e3, "receiver_m": RECEIVER / 1e3},
+        "transmitter_m has a distance of 3.*path_reference_m one of .*transmitter_m is probably in km",
+    ),
+    "degrees": (
+        lambda a: {"transmitter_m": np.stack([48 + 1e-5 * TIME, 11 + 0 * TIME, 2000 + 0 * TIME], -1)},
+        "transmitter_m moves by 2e-05 m over all pulses.*probably latitude and longitude in degrees",
+    ),
+    "not geocentric": (
+        lambda a: {"origin_deg_m": np.array([48.0, 11.0, 500.0])},
+        "transmitter_m must be geocentric .* a distance of 3605 m from the centre of the Earth",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", IMPLAUSIBLE)
+def test_units_that_physics_excludes(tmp_path, name):
+    change, match = IMPLAUSIBLE[name]
+    np.savez(tmp_path / "data.npz", **(archive() | change(archive())))
+    with pytest.raises(ValueError, match=match) as error:
+        read_path(tmp_path / "data.npz")
+    assert str(error.value).startswith(str(tmp_path / "data.npz"))

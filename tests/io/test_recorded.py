@@ -57,7 +57,7 @@ def test_axes_chirp_and_gain_come_from_the_file(tmp_path):
             "raw.npz: iq must hold plain numbers without pickled objects, got object",
         ),
         ({"iq": np.zeros((6, 80, 2), bool)}, "iq must be complex .* got bool"),
-        ({"f0_hz": 5.3e6}, r"f0_hz is 5.3e\+06 Hz, and should be 1.9986e\+07 to 9.993e\+15 Hz; check it"),
+        ({"f0_hz": 5.3e6}, r"f0_hz is 5.3e\+06 Hz, and should be 1.9986e\+07 to 9.993e\+15 Hz; if it is in MHz"),
         ({"fs_hz": 0.0}, "raw.npz: fs_hz must be one positive number, got 0.0"),
         ({"fs_hz": np.array([50e6])}, r"fs_hz must be one positive number, got float64 of shape \(1,\)"),
         ({"f0_hz": "high"}, "f0_hz must be one positive number, got 'high'"),
@@ -125,3 +125,22 @@ def test_recorded_block_is_read(recorded):
     assert recording.signal.data.shape == (1424, 2848)
     assert recording.radar.pulse.direction == -1
     assert recording.radar.pulse_samples == 1350  # of 1349.2 sample intervals, the first at its leading edge
+
+
+@pytest.mark.parametrize(
+    ("key", "factor", "said"),
+    [
+        ("f0_hz", 1e-9, "if it is in GHz"),
+        ("fs_hz", 1e-6, "if it is in MHz"),
+        ("pulse_s", 1e6, "if it is in us"),
+        ("slant_range_cell1_m", 1e-3, "if it is in km"),
+        ("v_eff_m_s", 1e-3, "if it is in km/s"),
+    ],
+)
+def test_a_likely_unit_is_named(tmp_path, key, factor, said):
+    satellite = {"fs_hz": 32e6, "prf_hz": 1257.0, "f0_hz": 5.3e9, "chirp_rate_hz_s": -7e11, "pulse_s": 41.7e-6}
+    satellite |= {"slant_range_cell1_m": 988e3, "v_eff_m_s": 7066.0}
+    iq = np.random.default_rng(1).normal(size=(8, 9)) + 1j
+    np.savez(tmp_path / "a.npz", iq=iq, **(satellite | {key: satellite[key] * factor}))
+    with pytest.raises(ValueError, match=f"a.npz: {key} is .*{said}"):
+        read_stripmap(tmp_path / "a.npz")

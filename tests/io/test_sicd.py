@@ -192,3 +192,13 @@ def test_images_that_cannot_be_written(tmp_path, change, match):
     with pytest.raises(ValueError, match=match), warnings.catch_warnings():
         write_sicd(image, tmp_path / "a.nitf", recording, stage, change.get("frame", FRAME))
     assert not list(tmp_path.iterdir())
+
+
+def test_half_a_file_is_named_without_the_log_of_a_library(tmp_path, caplog):
+    file = tmp_path / "cut.nitf"
+    file.write_bytes(b"NITF02.10".ljust(342) + b"%012d" % 5000 + bytes(900))
+    with pytest.raises(
+        ValueError, match=r"cut.nitf cannot be read as SICD: it is cut off: its header counts 5000 bytes"
+    ):
+        read_sicd(file)
+    assert not caplog.records

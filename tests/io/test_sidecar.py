@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
+import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -19,7 +20,7 @@ from tests.io.test_damaged import ARCHIVES, PATH, PROFILES, SPOTLIGHT, STRIPMAP,
 from tests.test_docs import DOCS, block_with
 from torchsar.cli import main
 from torchsar.core import Recording
-from torchsar.io import import_recording, read, read_inverse, read_stripmap, sidecar
+from torchsar.io import import_recording, read, read_inverse, read_path, read_stripmap, sidecar
 from torchsar.study.commands import run
 from torchsar.study.settings.text import parse
 
@@ -124,7 +125,7 @@ def two_files() -> tuple[list[np.ndarray], dict[str, Any]]:
 REAL = ["<i1", "<i2", ">i2", "<i4", ">i4", "<f2", ">f2", "<f4", ">f4", "<f8", ">f8"]
 LAYOUTS = {
     **{f"pairs {dtype}": flat(PAIRS.astype(dtype), "pulse range iq") for dtype in REAL},
-    "unsigned": flat(PAIRS.astype(np.int16).clip(0).astype(np.uint8), "pulse range iq"),
+    "unsigned": flat((PAIRS + np.int16(128)).astype(np.uint8), "pulse range iq", offset=128),
     "planes": flat(np.ascontiguousarray(np.moveaxis(PAIRS, -1, 0)), "iq pulse range"),
     "rows by turns": flat(np.ascontiguousarray(np.moveaxis(PAIRS, -1, 1)), "pulse iq range"),
     "transposed": flat(np.ascontiguousarray(PAIRS.transpose(1, 0, 2)), "range pulse iq"),
@@ -144,8 +145,7 @@ def test_flat_binary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, layout: st
         (tmp_path / name).write_bytes(bytes(samples.get("header_bytes", 0)) + part.tobytes())
     tree = {"system": "stripmap", "samples": samples, "radar": RADAR, "side": {"line_number": list(range(12))}}
     out = import_recording(tmp_path / "data.bin", tree, tmp_path / "out.npz")
-    iq = PAIRS.clip(0) if layout == "unsigned" else PAIRS
-    own = {"iq": iq, "line_number": STRIPMAP["line_number"], **{name: np.array(x) for name, x in RADAR.items()}}
+    own = {"iq": PAIRS, "line_number": STRIPMAP["line_number"], **{name: np.array(x) for name, x in RADAR.items()}}
     assert same(read_stripmap(out), read_stripmap(archived(tmp_path / "own.npz", own)))
 
 
@@ -190,6 +190,113 @@ def test_units_steps_attributes_and_further_files(tmp_path: Path) -> None:
     torch.testing.assert_close(found.aux["angle_rad"], torch.from_numpy(np.deg2rad(TURNTABLE["angle_deg"])))
 
 
+def imported(path: Path, data: np.ndarray, samples: Mapping[str, Any], **more: Any) -> torch.Tensor:
+    """Samples of a phase history in a flat binary file."""
+    data.tofile(path)
+    n, pulses = samples["shape"][samples["dims"].index("frequency")], samples["shape"][samples["dims"].index("pulse")]
+    side = {
+        "freq_hz": {"first": 77.0, "step": 0.01, "unit": "GHz"},
+        "transmitter_m": np.stack([np.zeros(pulses), 0.01 * np.arange(pulses), np.ones(pulses)], -1).tolist(),
+        "path_reference_m": [8.0] * pulses,
+    }
+    layout = {"key": "history", "dtype": data.dtype.name, **samples}
+    out = import_recording(path, {"system": "path", "samples": layout, "side": side, **more}, path.with_suffix(".npz"))
+    with np.load(out) as held:
+        assert held["history"].shape == (n, pulses)
+        return torch.from_numpy(held["history"].T.copy())
+
+
+HISTORY = np.random.default_rng(8).integers(-99, 99, (5, 6, 2))  # pulse, frequency, iq
+WHOLE = torch.view_as_complex(torch.from_numpy(HISTORY).float())
+
+
+@pytest.mark.parametrize(("order", "at"), [("qi", [1, 0]), ("iiqq", [0, 2, 1, 3]), ("QIIQ", [1, 0, 2, 3])])
+def test_the_order_of_i_and_q(tmp_path: Path, order: str, at: list[int]) -> None:
+    kept = HISTORY.reshape(5, -1, len(order))[..., at].astype(np.int16)
+    samples = {"shape": [5, 6, 2], "dims": ["pulse", "frequency", "iq"], "order": order}
+    assert torch.equal(imported(tmp_path / "data.bin", kept, samples), WHOLE)
+
+
+def test_bytes_around_lines_and_one_of_several_receivers(tmp_path: Path) -> None:
+    lines = np.stack([HISTORY - 5, HISTORY], 1).astype(np.int8).reshape(5, -1)  # pulse, receiver, ...
+    around = [np.full((5, n), 77, np.int8) for n in (3, 2)]
+    samples = {"shape": [5, 2, 6, 2], "dims": ["pulse", "receiver", "frequency", "iq"], "choose": {"receiver": 1}}
+    samples |= {"line_prefix_bytes": 3, "line_suffix_bytes": 2, "header_bytes": 0}
+    assert torch.equal(imported(tmp_path / "data.bin", np.hstack([around[0], lines, around[1]]), samples), WHOLE)
+
+
+def test_a_table_of_values(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py", reason="the extra `formats` is not installed")
+    table = np.arange(256, dtype=np.float32) ** 2
+    codes = np.random.default_rng(2).integers(0, 256, (*PAIRS.shape[:2], 2)).astype(np.uint8)
+    with h5py.File(tmp_path / "data.h5", "w") as file:
+        file["codes"], file["table"] = codes, table
+    samples = {"name": "codes", "dims": ["pulse", "range", "iq"], "table": "table", "offset": 21000.0}
+    tree = {"system": "stripmap", "samples": samples, "radar": RADAR}
+    found = read_stripmap(import_recording(tmp_path / "data.h5", tree, tmp_path / "out.npz"))
+    torch.testing.assert_close(torch.view_as_real(found.signal.data).numpy(), table[codes] - 21000)
+    with pytest.raises(ValueError, match="no array 'tabel'"):
+        import_recording(tmp_path / "data.h5", {**tree, "samples": {**samples, "table": "tabel"}}, tmp_path / "b.npz")
+
+
+def test_an_offset_is_removed_or_noticed(tmp_path: Path) -> None:
+    unsigned = (PAIRS + np.int16(128)).astype(np.uint8)
+    unsigned.tofile(tmp_path / "data.bin")
+    samples = {"dtype": "uint8", "shape": list(unsigned.shape), "dims": ["pulse", "range", "iq"]}
+    tree = {"system": "stripmap", "samples": samples, "radar": RADAR}
+    with pytest.warns(UserWarning, match=r"samples have a mean of I 1\d\d.* about 1.*, as sidecar: samples.off"):
+        import_recording(tmp_path / "data.bin", tree, tmp_path / "plain.npz")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        out = import_recording(
+            tmp_path / "data.bin", {**tree, "samples": {**samples, "offset": 128}}, tmp_path / "o.npz"
+        )
+        found = read_stripmap(out).signal.data
+        np.savez(tmp_path / "own.npz", allow_pickle=False, iq=unsigned, offset=128.0, **RADAR)
+        own = read_stripmap(tmp_path / "own.npz").signal.data
+    assert torch.equal(found, torch.view_as_complex(torch.from_numpy(PAIRS).float())) and torch.equal(own, found)
+    np.savez(tmp_path / "own.npz", allow_pickle=False, iq=unsigned, **RADAR)
+    with pytest.warns(UserWarning, match=r"own.npz: samples have a mean of .*, as offset"):
+        read_stripmap(tmp_path / "own.npz")
+
+
+def test_side_files_without_a_name_and_tables_of_text(tmp_path: Path) -> None:
+    write_numpy(tmp_path / "data.npz", PATH)
+    np.save(tmp_path / "path.npy", PATH["path_reference_m"])
+    header = "# east,north,up"
+    np.savetxt(tmp_path / "nav.csv", PATH["transmitter_m"], header=header[2:], delimiter=",", fmt="%.17g")
+    tree = tree_of(4)
+    tree["side"] |= {
+        "path_reference_m": {"file": "path.npy"},
+        "transmitter_m": {"file": "nav.csv", "name": "east, north,up"},
+    }
+    found = read_path(import_recording(tmp_path / "data.npz", tree, tmp_path / "out.npz"))
+    np.savez(tmp_path / "own.npz", allow_pickle=False, **PATH)
+    assert same(found, read_path(tmp_path / "own.npz"))
+    tree["side"]["transmitter_m"]["name"] = "east,north,down"
+    with pytest.raises(ValueError, match=r"\(table\) has no array 'east,north,down'.*accepted: east, north, up"):
+        import_recording(tmp_path / "data.npz", tree, tmp_path / "b.npz")
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_arrays_of_structures(tmp_path: Path, compressed: bool) -> None:
+    parts = [{name: x if k else -x for name, x in TURNTABLE.items()} for k in (0, 1)]
+    records = np.array([tuple(part.values()) for part in parts], [(name, object) for name in TURNTABLE])
+    savemat(tmp_path / "data.mat", {"scan": records}, do_compression=compressed)
+    tree = tree_of(2)
+    names = {one: f"scan(2)/{one}" for one in TURNTABLE}
+    tree["samples"]["name"] = names["sig"]
+    tree["radar"] = {one: names[one] for one in tree["radar"]}
+    tree["side"] = {one: names[one] for one in tree["side"]}
+    found = read_inverse(import_recording(tmp_path / "data.mat", tree, tmp_path / "out.npz"))
+    np.savez(tmp_path / "own.npz", allow_pickle=False, **TURNTABLE)
+    assert same(found, read_inverse(tmp_path / "own.npz"))
+    for wrong in ("scan/sig", "scan(3)/sig", "scan(1)/gis"):
+        tree["samples"]["name"] = wrong
+        with pytest.raises(ValueError, match=r"scan is an array of 2 structures with .*, such as scan\(1\)/"):
+            import_recording(tmp_path / "data.mat", tree, tmp_path / "b.npz")
+
+
 def test_positions_may_be_transposed(tmp_path: Path) -> None:
     tree = tree_of(4)
     tree["side"]["transmitter_m"] = {"name": "transmitter_m/data", "transpose": True}
@@ -214,11 +321,11 @@ MISTAKES: dict[str, tuple[dict[str, Any], list[str]]] = {
     "a key of the samples": ({"samples.dim": []}, ["samples: key 'dim' is not known", "did you mean 'dims'"]),
     "dims that are lists": ({"samples.dims": [["pulse"], "range"]}, ["samples.dims must be", "[['pulse'], 'range']"]),
     "dims": ({"samples.dims": ["line", "range"]}, ["samples.dims must be", "pulse and range", "['line', 'range']"]),
-    "no dims": ({"samples.dims": None}, ["samples.dims must be", "got None"]),
+    "no dims": ({"samples.dims": None}, ["samples lacks the key 'dims'"]),
     "too few dims": ({"samples.dims": ["pulse", "range"]}, ["(12, 40, 2)", "samples.dims are ['pulse', 'range']"]),
     "wrong order": ({"samples.dims": ["iq", "pulse", "range"]}, ["the dim iq must have 2", "(12, 40, 2)"]),
     "a name": ({"samples.name": "iq/dat"}, ["has no array 'iq/dat'", "did you mean 'iq/data'"]),
-    "no name": ({"samples.name": None}, ["samples.name must be the name of an array", "got None"]),
+    "no name": ({"samples.name": None}, ["holds the arrays iq/data, ", "give name, one of them"]),
     "a layout": ({"samples.dtype": "int8"}, ["samples.dtype", "is a numpy file; give name instead"]),
     "a radar key": ({"radar.prf": 3.0}, ["radar: key 'prf' is not known", "did you mean 'prf_hz'"]),
     "another unit": ({"radar.prf_hz": "3 m"}, ["radar.prf_hz has the unit 'm', and Hz is expected", "kHz"]),
@@ -237,6 +344,14 @@ MISTAKES: dict[str, tuple[dict[str, Any], list[str]]] = {
     "a missing number": ({"radar.prf_hz": ...}, ["lacks the keys ['prf_hz']"]),
     "no such file": ({"side.agc_db": {"file": "no.h5", "name": "x"}}, ["no.h5 does not exist"]),
     "a flag": ({"samples.conjugate": 1}, ["samples.conjugate must be true or false, got 1"]),
+    "a channel": ({"samples.dims": ["pulse", "range", "receiver"]}, ["name one index, from 0", "{'receiver': 2}"]),
+    "a wrong channel": ({"samples.choose": {"receiver": 0}}, ["choose must name one index", "got {'receiver': 0}"]),
+    "a wrong order": ({"samples.order": "iqq"}, ["order must have as many i as q", "'iqq'"]),
+    "an order without pairs": (
+        {"samples.order": "iiqqiq", "samples.dims": ["pulse", "range", "iq"]},
+        ["order must have as many i as q", "divides that of the samples, 40, got 'iiqqiq'"],
+    ),
+    "an offset": ({"samples.offset": [1.0, 2.0, 3.0]}, ["offset must be a number", "[1.0, 2.0, 3.0]"]),
     "imag beside iq": ({"samples.imag": "iq/data"}, ["samples must be complex, or real with one dim iq or one array"]),
 }
 
@@ -262,13 +377,17 @@ def test_a_mistake_is_one_sentence_and_nothing_is_written(source: Path, name: st
 
 FLAT_MISTAKES: dict[str, tuple[dict[str, Any], list[str]]] = {
     "cut off": ({"samples.shape": [13, 40, 2]}, ["has 960 bytes", "needs 1040", "cut off"]),
-    "no header": ({"samples.header_bytes": None, "samples.shape": [11, 40, 2]}, ["header_bytes must be"]),
-    "too small a shape": ({"samples.shape": [11, 40, 2]}, ["has 960 bytes", "needs 880; correct these keys"]),
+    "no header": ({"samples.header_bytes": "1"}, ["header_bytes must be a number of bytes"]),
+    "an odd prefix": ({"samples.line_prefix_bytes": -1}, ["numbers of bytes at least 0", "[0, -1, 0]"]),
+    "too small a shape": (
+        {"samples.shape": [11, 40, 2]},
+        ["needs 880, which would be 12 entries of its first dim; correct these"],
+    ),
     "a shape": ({"samples.shape": [12, -1, 2]}, ["shape must be a list of numbers of at least 1", "[12, -1, 2]"]),
     "a type": ({"samples.dtype": "in8"}, ["samples.dtype has the value 'in8'", "did you mean 'int8'"]),
     "an order": ({"samples.byte_order": "bg"}, ["samples.byte_order has the value 'bg'", "did you mean 'big'"]),
-    "a name": ({"samples.name": "iq"}, ["is no HDF5, MATLAB or numpy file", "give dtype and shape, and no name"]),
-    "an array without a file": ({"side.agc_db": "gain"}, ["side.agc_db", "is no HDF5, MATLAB or numpy file"]),
+    "a name": ({"samples.name": "iq"}, ["is no HDF5, MATLAB, numpy or .csv file", "give dtype and shape, and no name"]),
+    "an array without a file": ({"side.agc_db": "gain"}, ["side.agc_db", "is no HDF5, MATLAB, numpy or .csv file"]),
 }
 
 

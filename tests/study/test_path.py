@@ -144,3 +144,22 @@ def test_auto_takes_tiles_and_images_of_other_stages_have_no_points(tmp_path: Pa
     chosen = {"stages": {"image": {**TILES, "stage": "auto"}}}
     bench = bench_of(tmp_path, "path", processor={"recommended": chosen}, metrics={})
     assert "tiles at -40 dB was chosen" in bench.chosen[0]
+
+
+def test_a_pulse_rate_below_the_band_of_the_beam_is_named(tmp_path: Path) -> None:
+    """100 m/s at 9.6 GHz: a beam of 1 degree has a band of 4 v sin(0.5 deg) / lambda = 111.8 Hz."""
+    for width, verdict in ((1.0, "warn"), (0.8, "ok")):
+        bench = bench_of(tmp_path, "path", world=world("path", beam={"width_deg": width}))
+        (limit,) = (one for one in bench.system.limits(bench) if one.unit == "Hz")
+        assert limit.verdict == verdict and limit.limit == pytest.approx(111.8 * width, rel=2e-3)
+
+
+def test_a_motion_log_is_flown(tmp_path: Path) -> None:
+    rows = (f"{t / 50:.2f},-1500,{100 * t / 50 - 48},1500" for t in range(80))
+    (tmp_path / "log.csv").write_text("\n".join(["time_s,x,y,z", *rows]))
+    nominal = {"kind": "recorded", "file": str(tmp_path / "log.csv")}
+    own = {**PATH["world"]["transmitter"], "nominal": nominal}
+    found = metrics_of(bench_of(tmp_path, "path", world=world("path", transmitter=own)))
+    straight = metrics_of(bench_of(tmp_path, "path"))
+    for key in ("entropy_nats", "path_residual_rms_m"):
+        torch.testing.assert_close(found["ideal"][key], straight["ideal"][key], rtol=1e-3, atol=1e-9)

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from torchsar.core import Signal
-from torchsar.focus.path_image import TileImage
+from torchsar.focus.image_grid import ImageGrid
+from torchsar.focus.path_image import TileImage, spatial_band
+from torchsar.focus.requirements import Limit
 from torchsar.radar import LIGHT_M_S, AntennaPath
 from torchsar.radar.spotlight import frequency_step_hz
 
@@ -42,18 +44,33 @@ class SceneGrid:
     height_m: float
 
 
-def scene_grid(frequency_hz: Tensor, antennas: AntennaPath, corners_m: Tensor | None = None) -> SceneGrid:
+def scene_grid(
+    frequency_hz: Tensor,
+    antennas: AntennaPath,
+    corners_m: Tensor | None = None,
+    centre_m: Sequence[float] | None = None,
+) -> SceneGrid:
     """Choose the grid of an image from the geometry of its recording.
 
-    The range axis is the mean horizontal direction in which the path grows. The spacing is 1 /
-    1.25 of the finer resolution cell, the inverse of the extent of the spatial frequencies f
-    (gradient of the path) / c. The image covers the corners, or without these a square about the
-    origin, but no more than the band and the pulses image without ambiguity.
+    The image covers the corners, if they are known, but no more than the band and the pulses image
+    without ambiguity; steps between pulses count by their median, so that lost pulses do not crop
+    the image. Without corners the centre is
+    - the origin, if the reference paths follow the path over it;
+    - the middle of a closed path, such as a circle, whose references do not;
+    - else the middle of the range window, abeam of the path: towards +x, or, of a path along x, to
+      the right of the motion. The window begins at the radar if the reference is nearer than half
+      of it.
+    Without corners the image has the width of the window, and is as long in azimuth, or as long as
+    the path. The range axis is the mean horizontal direction in which the path grows, or x where
+    there is none. The spacing is 1 / 1.25 of the finer resolution cell, the inverse of the extent
+    of the spatial frequencies f (gradient of the path) / c at the centre; near the radar, where
+    cells differ, it is that of the finest cell of nine points, as far as 300,000 pixels hold it.
 
     Args:
         frequency_hz: Frequencies in Hz, rising in equal steps, float64 (frequency,).
         antennas: Path of the antennas without trials.
         corners_m: Corners of the scene in metres, float64 (corner, 3); None if they are not known.
+        centre_m: Centre of the image in metres along x and y, in place of that of the data.
 
     Returns:
         The grid.
@@ -62,12 +79,20 @@ def scene_grid(frequency_hz: Tensor, antennas: AntennaPath, corners_m: Tensor | 
         ValueError: If the frequencies do not rise in equal steps, or the direction to the scene
             does not change over the pulses.
     """
+    window_m = LIGHT_M_S / (2 * frequency_step_hz(frequency_hz))
+    near = corners_m is None and not _points_at_origin(antennas, window_m)
     centre = antennas.transmitter_m.new_zeros(3) if corners_m is None else corners_m.mean(0)
+    extent = (window_m, window_m)
+    if near:
+        centre, extent = _abeam(antennas, window_m, told=centre_m is None)
+    if centre_m is not None:
+        centre = torch.cat([centre.new_tensor(list(centre_m)), centre[2:]])
     away = [centre - place for place in antennas.places]
     slope = sum(2 / len(away) * v / torch.linalg.vector_norm(v, dim=-1, keepdim=True) for v in away)
     assert isinstance(slope, Tensor)
     mean = slope.mean(-2)
-    angle = math.atan2(float(mean[1]), float(mean[0]))
+    # by choice, directions that cancel to a tenth are all around
+    angle = math.atan2(float(mean[1]), float(mean[0])) if float(mean[:2].norm()) > 0.2 else 0.0
     axes = slope.new_tensor([[math.cos(angle), math.sin(angle), 0.0], [-math.sin(angle), math.cos(angle), 0.0]])
     along = slope @ axes.mT  # per pulse, along range and azimuth
     ends = torch.stack([along * f / LIGHT_M_S for f in (frequency_hz[0], frequency_hz[-1])])
@@ -77,20 +102,83 @@ def scene_grid(frequency_hz: Tensor, antennas: AntennaPath, corners_m: Tensor | 
             "the direction to the scene does not change over the pulses, so that there is no resolution in azimuth; "
             "an image needs antennas that move across the line of sight"
         )
-    clear = (
-        LIGHT_M_S / (frequency_step_hz(frequency_hz) * float(along[:, 0].abs().max())),
-        LIGHT_M_S / float(frequency_hz[-1] * along[:, 1].diff().abs().max()),
-    )
+    steps = slope.diff(dim=0).norm(dim=-1)
+    usual = float(steps[steps > 0].median())
+    if float(steps.max()) > 10 * usual:  # by choice, beyond what uneven speed makes
+        warnings.warn(
+            f"the largest step between pulses, at pulse {int(steps.argmax())}, is {float(steps.max()) / usual:.3g} "
+            "times the median one: pulses are missing there, which raises side lobes in azimuth",
+            stacklevel=3,
+        )
+    clear = (2 * window_m / float(along[:, 0].abs().max()), LIGHT_M_S / (float(frequency_hz[-1]) * usual))
+    if near and float(centre.norm()) > 0:  # what is unambiguous grows with the range
+        farther = 1 + extent[0] / 2 / float((centre - torch.stack(antennas.places).mean((0, 1))).norm())
+        clear = (clear[0], clear[1] * farther)
     step = 1 / (_OVERSAMPLING * max(band))
-    if corners_m is None:
-        reach = (clear[0], clear[0])
-    else:
-        across = (corners_m - centre) @ axes.mT
+    reach = extent if near else (clear[0], clear[0])
+    if corners_m is not None:
+        across = (corners_m - corners_m.mean(0)) @ axes.mT
         reach = (across.amax(0) - across.amin(0)).tolist()
         reach = tuple(size if size > 0 else clear[0] for size in reach)
     range_m, azimuth_m = (max(min(*pair), step) for pair in zip(reach, clear, strict=True))
     middle = axes @ centre
+    if near:
+        edges = [0.5 * (i * range_m * axes[0] + j * azimuth_m * axes[1]) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+        pulses = torch.tensor([[0, antennas.pulses]]).expand(9, 2)
+        low, high = spatial_band(centre + torch.stack(edges), axes, antennas, frequency_hz, pulses)
+        finest = 1 / (_OVERSAMPLING * float((high - low).max()))
+        step = min(step, max(finest, math.sqrt(range_m * azimuth_m / 3e5)))
     return SceneGrid(azimuth_m, range_m, step, (float(middle[0]), float(middle[1])), angle, float(centre[2]))
+
+
+def _points_at_origin(antennas: AntennaPath, window_m: float) -> bool:
+    """Whether the reference paths follow the path over the origin: they differ by less than a
+    quarter of it, by choice, where the range window is far from the radar.
+    """
+    over = antennas.path_m(antennas.transmitter_m.new_zeros(1, 3))[:, 0]
+    whole = over + antennas.reference_m
+    near_m = float(antennas.reference_m.median()) / 2 - window_m / 2
+    return bool((over.abs() / whole.clamp_min(1e-9)).median() < 0.25) and (near_m > 0 or _closed(antennas))
+
+
+def _closed(antennas: AntennaPath) -> bool:
+    """Whether a path comes back, so that its end is nearer to its start than half of its length
+    over pi, by choice.
+    """
+    place = torch.stack(antennas.places).mean(0)[:, :2]
+    return float((place[-1] - place[0]).norm()) < float(place.diff(dim=0).norm(dim=-1).sum()) / (2 * math.pi)
+
+
+def _abeam(antennas: AntennaPath, window_m: float, told: bool) -> tuple[Tensor, tuple[float, float]]:
+    """The middle of the scene of a radar that does not point at the origin, and its extents in
+    range and azimuth in metres. A warning says which side was chosen, if `told`.
+    """
+    place = torch.stack(antennas.places).mean(0)
+    middle = (place.amax(0) + place.amin(0)) / 2
+    middle = torch.cat([middle[:2], middle.new_zeros(1)])
+    if _closed(antennas):
+        return middle, (window_m, window_m)
+    along = place[-1, :2] - place[0, :2]
+    along = along / along.norm().clamp_min(1e-12)
+    side = torch.stack([along[1], -along[0], along.new_zeros(())])
+    side = -side if float(side[0]) < -0.5 else side
+    toward = -place.mean(0) * (1 - along.new_tensor([0.0, 0.0, 1.0]))
+    # the origin tells the side, if the path passes it at a distance
+    if float((toward @ side).abs()) > 0.1 * window_m:
+        side = side * torch.sign(toward @ side)
+    reference_m, height_m = float(antennas.reference_m.median()) / 2, float(place[:, 2].mean())
+    first = max(reference_m - window_m / 2, 0.0)
+    low, high = (math.sqrt(max(r**2 - height_m**2, 0.0)) for r in (first, first + window_m))
+    if told:
+        warnings.warn(
+            f"the phase history does not point at the origin: the image shows ground ranges from {low:.3g} to "
+            f"{high:.3g} m from the path, in the direction ({float(side[0]):.2f}, {float(side[1]):.2f}) of (x, y), "
+            "which a straight path does not tell from the opposite one; centre_m, azimuth_m and range_m choose another "
+            "area",
+            stacklevel=4,
+        )
+    length = float((place[-1] - place[0]).norm())
+    return middle + (low + high) / 2 * side, (high - low, max(high - low, length))
 
 
 class SpotlightImage(TileImage):
@@ -119,6 +207,7 @@ class SpotlightImage(TileImage):
         azimuth_m: Extent of the image along its azimuth axis in metres.
         range_m: Extent along its range axis in metres.
         step_m: Sample spacing in metres.
+        centre_m: Centre of the image in metres along x and y; None for that of `scene_grid`.
         window: "none", "hann" or "range", see `PathImage`.
         error_db: Largest rms error relative to the image of white noise, in dB.
 
@@ -132,6 +221,7 @@ class SpotlightImage(TileImage):
         azimuth_m: float | None = None,
         range_m: float | None = None,
         step_m: float | None = None,
+        centre_m: Sequence[float] | None = None,
         window: str = "hann",
         error_db: float = -60.0,
     ) -> None:
@@ -149,7 +239,7 @@ class SpotlightImage(TileImage):
                 f"{tuple(known['path_reference_m'].shape)}; select one trial"
             )
         antennas = AntennaPath(known["transmitter_m"], known.get("receiver_m"), known["path_reference_m"])
-        grid = scene_grid(known["frequency_hz"], antennas, side_data.get("scene_corners_m"))
+        grid = scene_grid(known["frequency_hz"], antennas, side_data.get("scene_corners_m"), centre_m)
         step = grid.step_m if step_m is None else step_m
         wanted = ((azimuth_m, grid.azimuth_m), (range_m, grid.range_m))
         extents = [of if given is None else given for given, of in wanted]
@@ -165,7 +255,41 @@ class SpotlightImage(TileImage):
         super().__init__(
             extents[0], extents[1], step, grid.centre_m, grid.range_axis_rad, grid.height_m, window, error_db
         )
-        self.side_data = known
+        self.side_data, self._own_step = known, step_m is None
+
+    def sampling_limits(self, antennas: AntennaPath, frequency_hz: Tensor) -> list[Limit]:
+        """Return the limits of a given spacing, see `PathImage`; none of that of `scene_grid`."""
+        return [] if self._own_step else super().sampling_limits(antennas, frequency_hz)
+
+    def form(self, history: Tensor, frequency_hz: Tensor, antennas: AntennaPath, grid: ImageGrid) -> Tensor:
+        """Form the image by tiles, of wide arcs as the sum of the images of parts.
+
+        Args:
+            history: Phase history, shape (..., pulse, frequency), complex.
+            frequency_hz: Frequencies in Hz, shape (frequency,).
+            antennas: Path of the antennas.
+            grid: Pixels.
+
+        Returns:
+            Image, shape (..., azimuth, range).
+        """
+        middle = grid.pixels_m(*(slice(n // 2, n // 2 + 1) for n in grid.counts))[0, 0]
+        place = torch.stack([x.detach().reshape(-1, antennas.pulses, 3).mean(0) for x in antennas.places]).mean(0)
+        away = (place - middle.to(place))[:, :2]
+        turn = torch.zeros(antennas.pulses, dtype=away.dtype, device=away.device)
+        turn[1:] = torch.remainder(torch.atan2(away[:, 1], away[:, 0]).diff() + math.pi, 2 * math.pi) - math.pi
+        turn = turn.cumsum(0)
+        # by choice parts of 15 degrees, which tiles image well, of arcs beyond 60 degrees
+        wide = float(turn.amax() - turn.amin()) > math.radians(60)
+        part = (turn / math.radians(15)).floor().long() if wide else torch.zeros_like(turn, dtype=torch.long)
+        image = 0
+        for one in part.unique():
+            pulses = part == one
+            receiver = None if antennas.receiver_m is None else antennas.receiver_m[..., pulses, :]
+            some = AntennaPath(antennas.transmitter_m[..., pulses, :], receiver, antennas.reference_m[..., pulses])
+            image = image + super().form(history[..., pulses, :], frequency_hz, some, grid)
+        assert isinstance(image, Tensor)
+        return image
 
     def forward(
         self,

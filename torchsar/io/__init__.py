@@ -10,6 +10,7 @@ phase history on any path (.npz)     `read_path`
 CPHD, a phase history                `read_cphd`, `write_cphd`
 SICD, a complex image                `read_sicd`, `write_sicd`
 HDF5, MATLAB, numpy, flat binary     `import_recording`, which writes an .npz file
+sweeps of an FMCW board              `fmcw_recording`
 images of a run (zarr)               `read_images`
 image for other programs             `write_geotiff`, `write_netcdf`
 strip longer than memory             `StripImage`, `write_strip_geotiff`
@@ -18,6 +19,7 @@ strip longer than memory             `StripImage`, `write_strip_geotiff`
 
 from torchsar.io.arrays import read_images
 from torchsar.io.cphd import read_cphd
+from torchsar.io.fmcw import fmcw_recording
 from torchsar.io.formats import read, read_history
 from torchsar.io.geotiff import write_geotiff, write_strip_geotiff
 from torchsar.io.inverse import read_inverse
@@ -32,6 +34,7 @@ from torchsar.io.write_sicd import write_sicd
 
 __all__ = [
     "StripImage",
+    "fmcw_recording",
     "import_recording",
     "read",
     "read_cphd",

@@ -6,7 +6,7 @@ HDF5 and MATLAB 7.3 need h5py, of the extra `formats`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +18,7 @@ from torchsar.core import ArrayFile
 from torchsar.io.extras import library, reading
 from torchsar.io.fields import complex_type, joined, refuse_absent
 from torchsar.io.matlab import MatlabFile
+from torchsar.radar.track import read_table
 from torchsar.spelling import did_you_mean
 
 Slices = tuple[slice, ...]
@@ -83,6 +84,18 @@ class Container:
     find: Callable[[str], tuple[Any, Callable[[Slices], np.ndarray]]]
     names: Callable[[], Iterable[str]]
 
+    def only(self) -> str:
+        """Return the name of the only array.
+
+        Raises:
+            ValueError: If there are several.
+        """
+        with reading(self.path, self.kind):
+            names = list(self.names())
+        if len(names) != 1:
+            raise ValueError(f"{self.path} ({self.kind}) holds the arrays {', '.join(names)}; give name, one of them")
+        return names[0]
+
     def array(self, name: str) -> BlockArray:
         """Return an array by its name.
 
@@ -120,7 +133,8 @@ class Container:
 
 
 def open_container(path: Path, stack: ExitStack) -> Container | None:
-    """Open a file by the format that its first bytes show: HDF5, MATLAB or numpy.
+    """Open a file by the format that its first bytes show, HDF5, MATLAB or numpy, or a table (.csv,
+    .txt) by its ending.
 
     Args:
         path: Path of the file.
@@ -148,17 +162,30 @@ def open_container(path: Path, stack: ExitStack) -> Container | None:
     if start.startswith((b"\x93NUMPY", b"PK\x03\x04")):
         held = ArrayFile(path)
         return Container(path, "numpy", lambda name: _whole(held[name].load()), lambda: held)
+    if path.suffix.lower() in (".csv", ".txt"):
+        columns = read_table(path)
+        return Container(path, "table", lambda name: _whole(_columns(columns, name)), lambda: columns)
     return None
 
 
-def flat_array(path: Path, dtype: np.dtype, shape: tuple[int, ...], header_bytes: int = 0) -> BlockArray:
+def _columns(columns: Mapping[str, np.ndarray], name: str) -> np.ndarray:
+    """One column of a table, or several, (row, column), whose names stand with commas between."""
+    held = [columns[one.strip()] for one in name.split(",")]
+    return held[0] if len(held) == 1 else np.stack(held, -1)
+
+
+def flat_array(
+    path: Path, dtype: np.dtype, shape: tuple[int, ...], header: int = 0, prefix: int = 0, suffix: int = 0
+) -> BlockArray:
     """Describe flat binary data: a header, then numbers with the last dimension contiguous.
 
     Args:
         path: Path of the file.
         dtype: Type and byte order of the numbers.
         shape: Shape of the array.
-        header_bytes: Number of bytes before the first number.
+        header: Number of bytes before the first line, which is an entry of the first dimension.
+        prefix: Number of bytes before the numbers of each line.
+        suffix: Number of bytes after them.
 
     Returns:
         The array, mapped into memory part by part.
@@ -166,15 +193,20 @@ def flat_array(path: Path, dtype: np.dtype, shape: tuple[int, ...], header_bytes
     Raises:
         ValueError: If the size of the file is not that of header and array.
     """
-    held, needed = path.stat().st_size, header_bytes + math.prod(shape) * dtype.itemsize
+    inner = [dtype.itemsize * math.prod(shape[i + 1 :]) for i in range(len(shape))]
+    line = prefix + inner[0] + suffix
+    held, needed = path.stat().st_size, header + shape[0] * line
     if held != needed:
+        lines = "" if held < header else f", which would be {(held - header) / line:.6g} entries of its first dim"
         raise ValueError(
-            f"{path} has {held} bytes, and header_bytes {header_bytes} with {dtype.name} of shape {shape} needs "
-            f"{needed}; correct these keys{', or copy the file again if it was cut off' if held < needed else ''}"
+            f"{path} has {held} bytes, and header_bytes {header} with {dtype.name} of shape {shape} and "
+            f"{prefix} and {suffix} bytes around each entry of the first dim needs {needed}{lines}; correct these "
+            f"keys{', or copy the file again if it was cut off' if held < needed else ''}"
         )
 
     def part(slices: Slices) -> np.ndarray:  # mapped anew, so that parts that were read need no memory
-        return np.array(np.memmap(path, dtype, "r", header_bytes, shape)[slices])
+        mapped = np.memmap(path, np.uint8, "r", header)
+        return np.array(np.ndarray(shape, dtype, mapped, prefix, (line, *inner[1:]))[slices])  # pyright: ignore[reportCallIssue, reportArgumentType]
 
     return BlockArray(path, "flat binary data", "", shape, dtype, part)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -39,14 +40,15 @@ def read_cphd(path: str | Path, dtype: torch.dtype = torch.complex64, channel: s
     arrives dt after that of the reference point (SRP) of its vector; in the domain TOA the peak of
     a target has the phase SGN 2 pi f_c dt, f_c the middle of FX1 and FX2. Both signs are accepted.
     Samples are multiplied by AmpSF, those of the domain FX beyond FX1 and FX2 are set to zero, as
-    are vectors with SIGNAL = 0, and vectors without finite parameters are dropped. Vectors whose
+    are vectors with SIGNAL = 0, and vectors without finite parameters are left out. Vectors whose
     SC0 or SCSS differ are resampled to a common band (chirp-z, in the domain FX only). Delays by
     the troposphere and the ionosphere are taken as those of the reference point.
 
     Args:
         path: Path of the file.
         dtype: complex64 or complex128, dtype of the profiles.
-        channel: Identifier of the channel; None for the reference channel of the file.
+        channel: Identifier of the channel; None for the reference channel of the file, where a
+            warning names the others.
 
     Returns:
         Recording of range profiles as by `read_path`, in the frame east, north, up (`LocalFrame`)
@@ -54,7 +56,8 @@ def read_cphd(path: str | Path, dtype: torch.dtype = torch.complex64, channel: s
         `AntennaPath.side_data` and `frequency_hz`; `origin_deg_m` (3,), latitude and longitude in
         degrees and height in metres of the IARP; `pulse_time_s` (pulse,), the times of transmission
         since the start of the collection; `scene_reference_m` (pulse, 3), the reference points;
-        `scene_corners_m` (4, 3), the corners of the imaged area. Two antennas that the file calls
+        `scene_corners_m` (4, 3), the corners of the imaged area in the horizontal plane through the
+        IARP. Two antennas that the file calls
         monostatic become one in the middle between them where that changes no path over the area by
         more than a thousandth of a wavelength.
 
@@ -67,10 +70,18 @@ def read_cphd(path: str | Path, dtype: torch.dtype = torch.complex64, channel: s
     path = Path(path)
     sarkit = library("sarkit.cphd", "formats", f"reading {path}")
     with reading(path, "CPHD"), path.open("rb") as file:
+        _refuse_version(file.read(64))
+        file.seek(0)
         reader = sarkit.Reader(file)
         head = _Head(sarkit.XmlHelper(reader.metadata.xmltree), path)
         name = head("Channel/RefChId") if channel is None else channel
-        _refuse_channel(head, name, path.stat().st_size)
+        channels = _refuse_channel(head, name, path.stat().st_size)
+        if channel is None and len(channels) > 1:
+            warnings.warn(
+                f"{path} holds the channels {', '.join(channels)}, of which {name}, its reference channel, is read; "
+                "channel (data.channel in a config) chooses another",
+                stacklevel=2,
+            )
         samples, vectors = reader.read_channel(name)
         return _recording(head, samples, vectors, dtype)
 
@@ -89,9 +100,22 @@ class _Head(NamedTuple):
         return value
 
 
-def _refuse_channel(head: _Head, name: str, size: int) -> None:
-    """Raise ValueError for a channel that does not exist, or has compressed samples, or more of
-    them than the bytes of the file hold.
+def _refuse_version(start: bytes) -> None:
+    """Raise ValueError for a file that does not begin with a version of CPHD that can be read."""
+    kind, _, version = start.partition(b"\n")[0].decode("latin-1").strip().partition("/")
+    if kind != "CPHD":
+        page = start.lstrip()[:1] == b"<"
+        raise ValueError(
+            f"it begins with {start[:24]!r} instead of CPHD/ and a version"
+            + (", as a page of the web does that was saved in place of the file; download it again" if page else "")
+        )
+    if version not in ("1.0.1", "1.1.0"):
+        raise ValueError(f"its version is {version}, and 1.0.1 and 1.1.0 are read; convert it")
+
+
+def _refuse_channel(head: _Head, name: str, size: int) -> list[str]:
+    """Names of the channels; raise ValueError for one that does not exist, or has compressed
+    samples, or more of them than the bytes of the file hold.
     """
     channels = {node.findtext("{*}Identifier"): node for node in head.xml.element_tree.findall("{*}Data/{*}Channel")}
     if name not in channels:
@@ -106,6 +130,7 @@ def _refuse_channel(head: _Head, name: str, size: int) -> None:
             f"{head.path} is cut off or damaged: {counts[0]} vectors of {counts[1]} samples {form} with their "
             f"parameters take {needed} bytes, and the file has {size}"
         )
+    return list(channels)
 
 
 def _recording(head: _Head, samples: np.ndarray, vectors: np.ndarray, dtype: torch.dtype) -> Recording:
@@ -117,6 +142,12 @@ def _recording(head: _Head, samples: np.ndarray, vectors: np.ndarray, dtype: tor
     if finite.sum() < 2:
         raise ValueError(f"{path} has {finite.sum()} vectors with finite parameters; an image needs two or more")
     if not finite.all():
+        lost = np.flatnonzero(~finite)
+        warnings.warn(
+            f"{path}: {len(lost)} of {len(finite)} vectors have no finite time, position or band and are left out, the "
+            f"first of them {', '.join(map(str, lost[:5]))}",
+            stacklevel=3,
+        )
         samples, vectors = samples[finite], vectors[finite]
     of = {name: torch.from_numpy(np.ascontiguousarray(vectors[name], "f8")) for name in _NEEDED}
     time = of["TxTime"]
@@ -127,9 +158,9 @@ def _recording(head: _Head, samples: np.ndarray, vectors: np.ndarray, dtype: tor
     frequency, shift_s, formed = (_of_frequencies if domain == "FX" else _of_delays)(samples.shape[-1], of, path)
     legs = [torch.linalg.vector_norm(place - point, dim=-1) for place in (transmitter, receiver)]
     edges = torch.tensor(np.asarray(head("SceneCoordinates/ImageAreaCornerPoints"), float))
-    # at the height of the reference point of the scene
     height = torch.full((len(edges),), frame.height_m, dtype=torch.float64)
     corners = frame.local_m(geocentric(edges[:, 0], edges[:, 1], height))
+    corners[:, 2] = 0  # the Earth falls away below the plane through the reference point
     antennas = AntennaPath(transmitter, receiver, legs[0] + legs[1] + LIGHT_M_S * shift_s)
     if head("CollectionID/CollectType") == "MONOSTATIC":
         antennas = _in_one_place(antennas, point, corners, float(frequency[-1]))

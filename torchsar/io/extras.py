@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import logging
 import os
 import warnings
 from collections.abc import Callable, Iterator
@@ -37,14 +38,19 @@ def library(module: str, extra: str, purpose: str) -> Any:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Leave out what libraries warn of their own code, which a user cannot change.
+    """Leave out what libraries log, and warn of their own code, which a user cannot change.
 
     Yields:
         Nothing.
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        yield
+    before = logging.root.manager.disable
+    logging.disable(logging.CRITICAL)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)
+            yield
+    finally:
+        logging.disable(before)
 
 
 @contextmanager
@@ -71,7 +77,9 @@ def reading(path: Path, kind: str) -> Iterator[None]:
         if str(error).startswith(str(path)):
             raise ValueError(text) from None
         plain = isinstance(error, ValueError) and text
-        reason = text if plain else f"{type(error).__name__}{': ' if text else ''}{text}"
+        reason = (
+            text if plain else f"it is damaged or of another kind ({type(error).__name__}{': ' if text else ''}{text})"
+        )
         raise ValueError(f"{path} cannot be read as {kind}: {reason[:300]}") from None
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import ArrayFile, Recording, StoredArray
+from torchsar.radar import LIGHT_M_S
 
 _ACCEPTED: dict[str, Callable[[float], bool]] = {
     "positive number": lambda x: x > 0,
@@ -214,3 +216,115 @@ def joined(real: np.ndarray, imag: np.ndarray) -> np.ndarray:
     samples = np.empty(real.shape, complex_type(np.result_type(real, imag)))
     samples.real, samples.imag = real, imag
     return samples
+
+
+def parted(pairs: np.ndarray, order: str) -> list[np.ndarray]:
+    """Part I and Q that follow each other in groups.
+
+    Args:
+        pairs: Numbers, (..., n, 2).
+        order: A group, such as "iq" or "iiqq", whose number of i divides n.
+
+    Returns:
+        I and Q, each (..., n).
+
+    Raises:
+        ValueError: If the order is none.
+    """
+    i, q = ([at for at, one in enumerate(order.lower()) if one == kind] for kind in "iq")
+    if not i or len(i) != len(q) or 2 * len(i) != len(order) or pairs.shape[-2] % len(i):
+        raise ValueError(
+            f"order must have as many i as q, such as iq, qi or iiqq, whose number divides that of the samples, "
+            f"{pairs.shape[-2]}, got {order!r}"
+        )
+    groups = pairs.reshape(*pairs.shape[:-2], -1, len(order))
+    return [groups[..., place].reshape(pairs.shape[:-1]) for place in (i, q)]
+
+
+def likely_unit(value: float, low: float, high: float, units: Mapping[str, float]) -> str:
+    """The end of a sentence about a value that is not plausible: the unit in which it would be.
+
+    Args:
+        value: The value.
+        low: Least plausible value.
+        high: Largest plausible value.
+        units: Factors of units by name.
+
+    Returns:
+        The end of the sentence.
+    """
+    found = next((unit for unit, factor in units.items() if low <= value * factor <= high), None)
+    return f"; if it is in {found}, say so or convert it" if found else "; check it"
+
+
+def refuse_implausible(
+    frequency_hz: Tensor, position_m: Tensor, reference_m: Tensor, names: tuple[str, str, str]
+) -> None:
+    """Check the unit of the frequencies and positions of a phase history by physics.
+
+    Args:
+        frequency_hz: Frequencies, (frequency,).
+        position_m: Positions of the moving antenna, (pulse, 3).
+        reference_m: Reference ranges, (pulse,).
+        names: Names of the three for messages.
+
+    Raises:
+        ValueError: If the carrier is not that of a radar or ladar; distance from the origin and
+            reference range differ by a factor of 1000; or the whole path is shorter than a quarter
+            of a wavelength.
+    """
+    low, high = 1e6, 3e15  # wavelengths of 300 m to 100 nm
+    carrier, distance = float(frequency_hz.mean()), float(torch.linalg.vector_norm(position_m, dim=-1).median())
+    if not low <= carrier <= high:
+        unit = likely_unit(carrier, 1e8, 1e12, {"GHz": 1e9, "MHz": 1e6, "kHz": 1e3, "THz": 1e12})
+        raise ValueError(f"{names[0]} is {carrier:.4g} Hz in the middle, and should be {low:g} to {high:g} Hz{unit}")
+    reference, extent = float(reference_m.median()), position_m.amax(0) - position_m.amin(0)
+    ratio = reference / distance if distance > 0 else 0.0
+    # where both are of one place they differ by some percent
+    for factor, of, other in ((1e3, names[1], names[2]), (1e-3, names[2], names[1])):
+        if 0.4 * factor < ratio < 2.5 * factor:  # 2, where a range stands for a path
+            near, far = (distance, reference) if factor > 1 else (reference, distance)
+            raise ValueError(
+                f"{of} has a distance of {near:.4g} m, and {other} one of {far:.4g} m, about 1000 times as much; {of} "
+                "is probably in km, say so or convert it"
+            )
+    wavelength = LIGHT_M_S / carrier
+    if 0 < float(extent.norm()) < wavelength / 4:
+        middle = position_m.mean(0).tolist()
+        degrees = abs(middle[0]) <= 90 and abs(middle[1]) <= 180 and abs(middle[2]) > 100
+        likely = (
+            "latitude and longitude in degrees in place of metres, give origin_deg_m and geocentric metres"
+            if degrees
+            else "in km"
+        )
+        raise ValueError(
+            f"{names[1]} moves by {float(extent.norm()):.3g} m over all pulses, less than a quarter of the wavelength "
+            f"of {wavelength:.3g} m, about {', '.join(f'{x:.6g}' for x in middle)}; it is probably {likely}"
+        )
+
+
+class Level:
+    """Mean and deviation of samples that come in blocks, by which an offset is noticed."""
+
+    def __init__(self) -> None:
+        self._moments = np.zeros(4)
+
+    def add(self, samples: np.ndarray) -> None:
+        """Count a block of complex samples."""
+        i, q = (part.astype(np.float64) for part in (np.real(samples), np.imag(samples)))
+        self._moments += np.array([i.size, i.sum(), q.sum(), np.vdot(i, i) + np.vdot(q, q)])
+
+    def warn(self, what: str, key: str) -> None:
+        """Warn of a mean above half the deviation, which receivers do not have; the key names what
+        removes it.
+        """
+        n, *sums, square = self._moments.tolist()
+        i, q = (x / n for x in sums)
+        deviation = math.sqrt(max(square / n - i**2 - q**2, 0) / 2)
+        if max(abs(i), abs(q)) > deviation / 2:
+            warnings.warn(
+                f"{what}: samples have a mean of I {i:.4g} and Q {q:.4g} and a standard deviation of {deviation:.3g}; "
+                f"if this is the offset of numbers without sign, give its exact value, about {(i + q) / 2:.3g}, as "
+                f"{key}",
+                stacklevel=2,
+            )

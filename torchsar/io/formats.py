@@ -51,6 +51,10 @@ _NOT_COMPRESSED = (
     "holds received signals before range compression (CRSD), which are not read; convert it to compensated phase "
     "histories (CPHD)"
 )
+_TABLE = (
+    "is a table of numbers, such as a motion log, and holds no samples; name it in the sidecar of the samples (side: "
+    'transmitter_m: {file: FILE, name: "x,y,z"}), or read it by torchsar.radar.read_track'
+)
 # the content decides, then the ending
 FORMATS = (
     Format("CPHD", (".cphd",), (b"CPHD/",), read_cphd),
@@ -58,6 +62,7 @@ FORMATS = (
     Format("SICD", (".nitf", ".ntf", ".sicd"), (b"NITF", b"NSIF"), read_sicd),
     Format("HDF5", (".h5", ".hdf5"), (b"\x89HDF\r\n\x1a\n",), _NEEDS_SIDECAR),
     Format("MATLAB", (".mat",), (b"MATLAB 5.0", b"MATLAB 7.3"), _NEEDS_SIDECAR),
+    Format("table", (".csv", ".txt"), (), _TABLE),
     Format("numpy archive", (".npz",), (b"PK\x03\x04", b"PK\x05\x06", b"\x93NUMPY"), _read_archive),
 )
 
@@ -91,7 +96,7 @@ def format_of(path: str | Path) -> Format:
     return matches[0]
 
 
-def read(path: str | Path, dtype: torch.dtype = torch.complex64) -> Recording | Signal:
+def read(path: str | Path, dtype: torch.dtype = torch.complex64, channel: str | None = None) -> Recording | Signal:
     """Read a data file of any format, which its first bytes or its ending tell.
 
     >>> import numpy, pathlib, tempfile
@@ -108,6 +113,7 @@ def read(path: str | Path, dtype: torch.dtype = torch.complex64) -> Recording | 
     Args:
         path: Path of the file.
         dtype: complex64 or complex128, dtype of the samples.
+        channel: Identifier of the channel of a CPHD file; None for its reference channel.
 
     Returns:
         Recording; of an image a Signal with the axes (azimuth, range).
@@ -121,10 +127,14 @@ def read(path: str | Path, dtype: torch.dtype = torch.complex64) -> Recording | 
     path, reader = Path(path), format_of(path).read
     if isinstance(reader, str):
         raise ValueError(f"{path} {reader}")
-    return reader(path, dtype)
+    if channel is None:
+        return reader(path, dtype)
+    if reader is not read_cphd:
+        raise ValueError(f"{path} is no CPHD file, which alone has channels, got the channel {channel!r}; leave it out")
+    return read_cphd(path, dtype, channel)
 
 
-def read_history(path: str | Path, dtype: torch.dtype = torch.complex64) -> Recording:
+def read_history(path: str | Path, dtype: torch.dtype = torch.complex64, channel: str | None = None) -> Recording:
     """Read a phase history with the positions of its antennas from a file of any format.
 
     >>> import numpy, pathlib, tempfile
@@ -138,6 +148,7 @@ def read_history(path: str | Path, dtype: torch.dtype = torch.complex64) -> Reco
     Args:
         path: Path of the file.
         dtype: complex64 or complex128, dtype of the profiles.
+        channel: Identifier of the channel of a CPHD file; None for its reference channel.
 
     Returns:
         Recording as by `read_path`.
@@ -148,9 +159,9 @@ def read_history(path: str | Path, dtype: torch.dtype = torch.complex64) -> Reco
         ValueError: If the file is damaged, of no known format, or has no such content.
     """
     found = format_of(path)
-    if found.read is _read_archive:
+    if found.read is _read_archive and channel is None:
         return read_path(path, dtype)
-    recording = read(path, dtype)
+    recording = read(path, dtype, channel)
     if not isinstance(recording, Recording) or "transmitter_m" not in recording.aux:
         raise ValueError(f"{path}: {found.name} holds no phase history with positions of the antennas")
     return recording

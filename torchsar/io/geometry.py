@@ -28,7 +28,8 @@ def frame_of(recording: Recording, frame: LocalFrame | None) -> LocalFrame:
     if "origin_deg_m" not in recording.aux:
         raise ValueError(
             "the recording does not say where on the Earth it lies; give frame=LocalFrame(latitude_deg, "
-            "longitude_deg, height_m) of the origin of its coordinates"
+            "longitude_deg, height_m) of the origin of its coordinates, after torchsar export --origin LATITUDE "
+            "LONGITUDE HEIGHT"
         )
     return LocalFrame(*recording.aux["origin_deg_m"].tolist())
 

@@ -13,7 +13,16 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Recording, StoredArray, refuse_non_finite
-from torchsar.io.fields import Described, naming, number, read_described, refuse_missing, shown, vector
+from torchsar.io.fields import (
+    Described,
+    naming,
+    number,
+    read_described,
+    refuse_implausible,
+    refuse_missing,
+    shown,
+    vector,
+)
 from torchsar.radar import LIGHT_M_S, InverseRadar, range_profiles
 from torchsar.radar.spotlight import frequency_step_hz
 
@@ -214,6 +223,7 @@ def _spotlight_radar(fields: Mapping[str, StoredArray], shape: tuple[int, ...]) 
             "r0_m must be positive and the antenna must not be at the scene centre, "
             f"got a least r0_m of {float(reference.min()):g}"
         )
+    refuse_implausible(frequency, position, reference, ("freq_hz", "the antenna position x_m, y_m, z_m", "r0_m"))
     prf = number(fields["prf_hz"]) if "prf_hz" in fields else 1.0
     first, last = (position[i] / torch.linalg.vector_norm(position[i]) for i in (0, -1))
     chord = float(torch.linalg.vector_norm(last - first))

@@ -7,6 +7,7 @@ MathWorks, MAT-File Format, 2018, level 5.
 from __future__ import annotations
 
 import math
+import re
 import zlib
 from collections.abc import Iterator
 from itertools import islice
@@ -23,6 +24,10 @@ _MATRIX, _COMPRESSED, _STRUCT, _COMPLEX = 14, 15, 2, 0x800
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 # numbers by the class of the array, which may be wider, of the format
 _CLASSES = dict(enumerate(("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"), 6))
+
+
+# name of a variable or field, and the number of an element of an array of structures
+_PLACE = re.compile(r"([^()]*)(?:\((\d+)\))?.*", re.DOTALL)
 
 
 class _Matrix(NamedTuple):
@@ -66,7 +71,8 @@ class MatlabFile:
         """Load an array.
 
         Args:
-            name: Names of a variable and of fields of structures, with '/' between them.
+            name: Names of a variable and of fields of structures, with '/' between them, and
+                elements of arrays of structures as in MATLAB, such as `data(2)/fp`.
 
         Returns:
             The array, with the dims that it has in MATLAB.
@@ -75,14 +81,15 @@ class MatlabFile:
             KeyError: If there is no such array.
             ValueError: If it does not hold numbers, or the file is damaged.
         """
-        first, *fields = name.split("/")
+        (first, index), *fields = (_PLACE.fullmatch(part).groups() for part in name.split("/"))  # pyright: ignore[reportOptionalMemberAccess]
         kind, content = self._variables[first]
         try:
             held = self._matrix(memoryview(zlib.decompress(content)[8:]) if kind == _COMPRESSED else content)
         except zlib.error as error:
             raise ValueError(f"a compressed variable is damaged ({error})") from None
-        for field in fields:
-            held = self._field(held, field)
+        for field, next_index in fields:
+            held, index = self._field(held, first, index, field), next_index
+            first = f"{first}/{field}"
         return self._numbers(held, name)
 
     def _matrix(self, data: memoryview) -> _Matrix:
@@ -95,18 +102,24 @@ class MatlabFile:
         kind = int(np.frombuffer(flags, f"{self._order}u4")[0])
         return _Matrix(bytes(name).decode("latin-1"), kind, shape, elements)
 
-    def _field(self, held: _Matrix, wanted: str) -> _Matrix:
-        """The array in a field of a structure."""
-        if held.flags & 0xFF != _STRUCT or math.prod(held.shape) != 1:
+    def _field(self, held: _Matrix, owner: str, index: str | None, wanted: str) -> _Matrix:
+        """The array in a field of a structure, or of an element of an array of structures."""
+        count = math.prod(held.shape)
+        if held.flags & 0xFF != _STRUCT:
             raise KeyError(wanted)
         length, text = (next(held.elements, (0, b""))[1] for _ in range(2))
         n = int(np.frombuffer(length, f"{self._order}i4")[0]) if len(length) == 4 else 0
         if n < 1:
             raise ValueError("the names of a structure are damaged")
         names = [bytes(text[at : at + n]).split(b"\0")[0].decode("latin-1") for at in range(0, len(text) - n + 1, n)]
-        if wanted not in names:
-            raise KeyError(wanted)
-        kind, data = next(islice(held.elements, names.index(wanted), None), (0, memoryview(b"")))
+        element = int(index or "1") - 1
+        if wanted not in names or not 0 <= element < count or (index is None and count > 1):
+            raise ValueError(
+                f"{owner} is an array of {count} structures with the fields {', '.join(names)}; name a field of one of "
+                f"them, such as {owner}{'(1)' if count > 1 else ''}/{names[0]}, got {owner}"
+                f"{f'({index})' if index else ''}/{wanted}"
+            )
+        kind, data = next(islice(held.elements, element * len(names) + names.index(wanted), None), (0, memoryview(b"")))
         if kind != _MATRIX:
             raise ValueError("a structure is damaged")
         return self._matrix(data)

@@ -12,7 +12,16 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Recording, StoredArray, refuse_non_finite
-from torchsar.io.fields import Described, naming, number, read_described, refuse_missing, shown, vector
+from torchsar.io.fields import (
+    Described,
+    naming,
+    number,
+    read_described,
+    refuse_implausible,
+    refuse_missing,
+    shown,
+    vector,
+)
 from torchsar.io.inverse import describe_inverse, frequencies, history_radar, matrix, profiles_of
 from torchsar.radar import AntennaPath, LocalFrame, resample_path
 
@@ -94,6 +103,9 @@ def describe_path(fields: Mapping[str, StoredArray], path: Path) -> Described:
         reference_m = float(antennas.reference_m.mean()) / 2
         if not reference_m >= 0:
             raise ValueError(f"path_reference_m must be paths of 0 m or more, got a mean of {2 * reference_m:g} m")
+        moved = max(antennas.places, key=lambda place: float(place.std(0).norm()))
+        half = antennas.reference_m / 2
+        refuse_implausible(frequency, moved, half, ("freq_hz", "transmitter_m", "path_reference_m"))
         radar = history_radar(frequency, _prf_hz(fields, time), reference_m)
         origin = {"origin_deg_m": vector(fields["origin_deg_m"], 3)} if "origin_deg_m" in fields else {}
     aux = {"frequency_hz": frequency, **antennas.side_data(), **origin}
@@ -116,7 +128,15 @@ def _places(fields: Mapping[str, StoredArray], antenna: str, pulses: int, time: 
     if "origin_deg_m" in fields:
         origin = vector(fields["origin_deg_m"], 3).tolist()
         with naming(fields["origin_deg_m"].what):
-            place = LocalFrame(*origin).local_m(place)
+            frame = LocalFrame(*origin)
+        low = float(torch.linalg.vector_norm(place, dim=-1).min())
+        if low < 6.3e6:  # metres, below the surface of the Earth
+            raise ValueError(
+                f"{field.what} must be geocentric coordinates in metres where origin_deg_m is given, but has a "
+                f"distance of {low:.4g} m from the centre of the Earth, such as {place.reshape(-1, 3)[0].tolist()}; "
+                "convert latitude and longitude in degrees by torchsar.radar.geocentric, or kilometres to metres"
+            )
+        place = frame.local_m(place)
     if records is None:
         return place.expand(pulses, 3).clone()
     if time is None:

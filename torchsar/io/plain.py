@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from torchsar.core import ArrayFile
+from torchsar.radar.track import read_table
 
 
-def read_track(file: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read a track of times in seconds and displacements in metres.
+def measured_displacement(file: str | Path) -> tuple[np.ndarray, np.ndarray]:
+    """Read times in seconds and displacements in metres.
 
     Args:
         file: Text or .csv file of two columns (separated by commas or blanks, a line of names is
@@ -24,35 +25,17 @@ def read_track(file: str | Path) -> tuple[np.ndarray, np.ndarray]:
         ValueError: If the file does not exist or holds anything else; the message names the file.
     """
     path = Path(file)
-    if not path.is_file():
-        raise ValueError(
-            f"{path}: no such file; a measured track is a text, .csv, .npy or .npz file of times "
-            "(s) and displacements (m)"
-        )
     expected = f"{path}: expected two columns, time in s and displacement in m"
     try:
-        if path.suffix not in (".npy", ".npz"):
-            table = _text(path)
-        else:
-            stored = ArrayFile(path)
-            if "" not in stored:
-                return stored["time_s"].load("iuf"), stored["displacement_m"].load("iuf")
-            table = stored[""].load("iuf")
+        stored = ArrayFile(path) if path.suffix == ".npz" else {}
+        if "" not in stored and "displacement_m" in stored:
+            return stored["time_s"].load("iuf"), stored["displacement_m"].load("iuf")
+        columns = list(read_table(path).values())
     except (KeyError, OSError, ValueError) as problem:
         raise ValueError(f"{expected} (.npz: time_s and displacement_m), but {problem}") from None
-    if table.ndim != 2 or table.shape[1] != 2:
-        raise ValueError(f"{expected}, got an array of shape {table.shape}")
-    return table[:, 0], table[:, 1]
-
-
-def _text(path: Path) -> np.ndarray:
-    """Numbers of a text file without its comments and its line of names."""
-    plain = path.read_text().replace(",", " ").replace(";", " ").splitlines()
-    lines = [line for line in plain if line.strip() and not line.lstrip().startswith("#")]
-    try:
-        return np.loadtxt(lines, ndmin=2)
-    except ValueError:  # a line of names
-        return np.loadtxt(lines[1:], ndmin=2)
+    if len(columns) != 2:
+        raise ValueError(f"{expected}, got {len(columns)} columns")
+    return columns[0], columns[1]
 
 
 def read_array(file: str | Path, key: str | None = None) -> np.ndarray:

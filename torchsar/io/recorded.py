@@ -6,7 +6,10 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +17,20 @@ import numpy as np
 import torch
 
 from torchsar.core import Recording, StoredArray
-from torchsar.io.fields import Described, joined, naming, number, read_described, refuse_missing
+from torchsar.io.fields import (
+    Described,
+    Level,
+    joined,
+    likely_unit,
+    naming,
+    number,
+    read_described,
+    refuse_missing,
+    shown,
+    vector,
+)
 from torchsar.radar import LIGHT_M_S, LinearFM, StripmapRadar
+from torchsar.repair.placing import LinePlan, regular_lines
 
 # keys of the archive: samples, then numbers
 _REQUIRED = ("iq", "fs_hz", "prf_hz", "f0_hz", "chirp_rate_hz_s", "pulse_s", "slant_range_cell1_m", "v_eff_m_s")
@@ -29,10 +44,12 @@ _RANGES = {
     "v_eff_m_s": (1e-3, 3e4, "m/s"),
 }
 # optional keys that become side data of the recording
-_AUX = ("agc_db", "line_number", "pilot")
+_AUX = ("agc_db", "line_number", "line_time_s", "pilot")
+# numbers that may differ from line to line
+_VARYING = ("prf_hz", "slant_range_cell1_m")
 
 
-def read_stripmap(path: str | Path, dtype: torch.dtype = torch.complex64) -> Recording:
+def read_stripmap(path: str | Path, dtype: torch.dtype = torch.complex64, regular: bool = False) -> Recording:
     """Read a raw stripmap recording from a numpy archive.
 
     >>> import numpy, pathlib, tempfile
@@ -50,25 +67,49 @@ def read_stripmap(path: str | Path, dtype: torch.dtype = torch.complex64) -> Rec
     - `chirp_rate_hz_s`, `pulse_s`: chirp rate, negative for a down-chirp, and pulse length.
     - `slant_range_cell1_m`: slant range of a target whose echo begins at range cell 1.
     - `v_eff_m_s`: nominal effective velocity.
-    It may hold `first_cell` (range cell of the first sample, counted from 1, by default 1), `c_m_s`
-    (speed of light), `agc_db` (line,) (attenuation of the receiver in dB, which is compensated
-    here), `line_number` (line,) and `pilot` (sample,), a recorded pilot tone. Other keys are
-    ignored, including the Doppler ambiguity number, which is estimated from the data.
+    It may hold these:
+    - `offset`: a number, or one for I and Q, that samples exceed their true values by and that is
+      subtracted, such as 127.5 of bytes without sign.
+    - `first_cell`: range cell of the first sample, counted from 1, by default 1.
+    - `c_m_s`: speed of light.
+    - `agc_db` (line,): attenuation of the receiver in dB, which is compensated here.
+    - `line_number` (line,), which jumps where lines were lost, and `line_time_s` (line,), the times
+      of the pulses. `prf_hz` and `slant_range_cell1_m` may have one number per line, too, where the
+      pulse rate or the start of the range window changes.
+    - `pilot` (sample,): a recorded pilot tone.
+    Other keys are ignored, including the Doppler ambiguity number, which is estimated from the
+    data. Samples whose mean exceeds half their standard deviation cause a UserWarning.
 
     Args:
         path: Path of the archive.
         dtype: complex64 or complex128, dtype of the samples.
+        regular: Whether lines are put on a regular grid by their numbers, times and window starts,
+            as `regular_lines` does; a warning says what was done, and `missing` (line,) of the side
+            data which lines were lost.
 
     Returns:
-        Recording with the axes (pulse, range), a StripmapRadar, and the optional side data in
-        `aux`.
+        Recording with the axes (pulse, range), a StripmapRadar with the usual pulse rate and the
+        nearest window start, and the optional side data in `aux`, with `line_time_s` and
+        `window_start_m` of what differs from line to line.
 
     Raises:
         FileNotFoundError: If there is no such file.
         ValueError: If the file is not such an archive, a key is missing or invalid, or a number is
             far from those of any recording.
     """
-    return read_described(path, dtype, "raw stripmap data", describe_stripmap)
+    recording = read_described(path, dtype, "raw stripmap data", describe_stripmap)
+    level = Level()
+    level.add(recording.signal.data.numpy())
+    level.warn(str(path), "offset")
+    if not regular:
+        return recording
+    with naming(path):
+        plan = LinePlan.of(recording.radar, recording.aux, len(recording.signal.data))
+        for note in () if plan is None else plan.notes:
+            warnings.warn(f"{path}: {note}", stacklevel=2)
+        found = regular_lines(recording)
+        none = torch.zeros(len(found.signal.data), dtype=torch.bool)
+        return replace(found, aux={"missing": none, **found.aux})
 
 
 def describe_stripmap(fields: Mapping[str, StoredArray], path: Path) -> Described:
@@ -86,7 +127,15 @@ def describe_stripmap(fields: Mapping[str, StoredArray], path: Path) -> Describe
     """
     refuse_missing(fields, path, _REQUIRED, "a raw stripmap archive")
     signs = {"chirp_rate_hz_s": "number other than zero"}
-    numbers = {key: number(fields[key], signs.get(key, "positive number")) for key in _REQUIRED[1:]}
+    varying = {key: fields[key] for key in _VARYING if fields[key].shape == fields["iq"].shape[:1] != (1,)}
+    numbers = {
+        key: number(fields[key], signs.get(key, "positive number")) for key in _REQUIRED[1:] if key not in varying
+    }
+    per_line = {key: vector(field, field.shape[0]) for key, field in varying.items()}
+    for key, values in per_line.items():
+        if not bool((values > 0).all()):
+            raise ValueError(f"{fields[key].what} must be positive numbers, got a least one of {float(values.min()):g}")
+    numbers |= {key: float(x.median() if key == "prf_hz" else x.min()) for key, x in per_line.items()}
     c = number(fields["c_m_s"]) if "c_m_s" in fields else LIGHT_M_S
     first = number(fields["first_cell"], "whole number") if "first_cell" in fields else 1
     iq = fields["iq"]
@@ -109,12 +158,30 @@ def describe_stripmap(fields: Mapping[str, StoredArray], path: Path) -> Describe
             wave_speed_m_s=c,
         )
         aux: dict[str, Any] = {name: _side(fields[name], name, iq) for name in _AUX if name in fields}
-    return Described(iq, radar, aux, _samples)
+        if "prf_hz" in per_line:
+            aux.setdefault("line_time_s", np.cumsum(np.append(0.0, 1 / per_line["prf_hz"][:-1].numpy())))
+        if "slant_range_cell1_m" in per_line:
+            start = per_line["slant_range_cell1_m"].numpy()
+            aux["window_start_m"] = start + (radar.near_range_m - start.min())
+    return Described(iq, radar, aux, partial(_samples, offset=_offset(fields)))
 
 
-def _samples(iq: np.ndarray) -> np.ndarray:
-    """Complex samples (line, sample) of complex ones, or of I and Q."""
-    return iq if iq.ndim == 2 else joined(iq[..., 0], iq[..., 1])
+def _samples(iq: np.ndarray, offset: complex) -> np.ndarray:
+    """Complex samples (line, sample) of complex ones, or of I and Q, without their offset."""
+    data = iq if iq.ndim == 2 else joined(iq[..., 0], iq[..., 1])
+    return data - offset if offset else data
+
+
+def _offset(fields: Mapping[str, StoredArray]) -> complex:
+    """What samples exceed their true values by."""
+    if "offset" not in fields:
+        return 0
+    both = np.broadcast_to(fields["offset"].load("iuf"), 2) if fields["offset"].shape in ((), (1,), (2,)) else None
+    if both is None or not np.isfinite(both).all():
+        raise ValueError(
+            f"{fields['offset'].what} must be one finite number, or one for I and Q, got {shown(fields['offset'])}"
+        )
+    return complex(*both.tolist())
 
 
 def _refuse_implausible(numbers: Mapping[str, float], c: float) -> None:
@@ -123,7 +190,9 @@ def _refuse_implausible(numbers: Mapping[str, float], c: float) -> None:
     ranges = {**_RANGES, "f0_hz": (c / 15, c / 3e-8, "Hz")}
     for key, (low, high, unit) in ranges.items():
         if not low <= numbers[key] <= high:
-            raise ValueError(f"{key} is {numbers[key]:g} {unit}, and should be {low:g} to {high:g} {unit}; check it")
+            factors = {"Hz": {"MHz": 1e6, "GHz": 1e9, "kHz": 1e3}, "s": {"us": 1e-6, "ms": 1e-3, "ns": 1e-9}}
+            likely = likely_unit(numbers[key], low, high, factors.get(unit, {"km": 1e3, "mm": 1e-3}))
+            raise ValueError(f"{key} is {numbers[key]:g} {unit}, and should be {low:g} to {high:g} {unit}{likely}")
     carrier, band = numbers["f0_hz"], abs(numbers["chirp_rate_hz_s"]) * numbers["pulse_s"]
     if band > 2 * carrier:
         raise ValueError(
@@ -133,6 +202,17 @@ def _refuse_implausible(numbers: Mapping[str, float], c: float) -> None:
         raise ValueError(
             f"pulse_s of {numbers['pulse_s']:g} s is longer than the pulse interval, 1 / prf_hz of "
             f"{1 / numbers['prf_hz']:g} s; check both"
+        )
+    blind, near, speed = c * numbers["pulse_s"] / 2, numbers["slant_range_cell1_m"], numbers["v_eff_m_s"]
+    if near < blind / 4:
+        raise ValueError(
+            f"slant_range_cell1_m is {near:g} m, far within the {blind:g} m that the pulse of {numbers['pulse_s']:g} s "
+            f"covers while it is sent{likely_unit(near, blind, 1e7, {'km': 1e3})}"
+        )
+    if near > 2e5 and speed < 50:
+        raise ValueError(
+            f"v_eff_m_s is {speed:g} m/s at a slant range of {near:g} m, which only satellites see, and should be some "
+            f"km/s{likely_unit(speed, 1e3, 2e4, {'km/s': 1e3})}"
         )
 
 

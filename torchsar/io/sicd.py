@@ -39,6 +39,14 @@ def read_sicd(path: str | Path, dtype: torch.dtype = torch.complex64) -> Signal:
     path = Path(path)
     sarkit = library("sarkit.sicd", "formats", f"reading {path}")
     with reading(path, "SICD"), path.open("rb") as file:
+        # the length of the file, which the header of NITF 2.1 holds here
+        start, held = file.read(354), path.stat().st_size
+        length = start[342:]
+        if not start.startswith((b"NITF", b"NSIF")):
+            raise ValueError(f"it begins with {start[:24]!r} instead of NITF; give the file of a SICD image")
+        if length.isdigit() and int(length) > held:
+            raise ValueError(f"it is cut off: its header counts {int(length)} bytes, and it has {held}; copy it again")
+        file.seek(0)
         reader = sarkit.NitfReader(file)
         xml = sarkit.XmlHelper(reader.metadata.xmltree)
         counts = [int(xml.load(f"{{*}}ImageData/{{*}}{name}")) for name in ("NumRows", "NumCols")]

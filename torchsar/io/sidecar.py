@@ -23,7 +23,7 @@ import torch
 from torchsar.core import Recording, StoredArray
 from torchsar.io.containers import BlockArray, Container, flat_array, open_container
 from torchsar.io.extras import write_whole
-from torchsar.io.fields import Described, complex_type, joined, naming
+from torchsar.io.fields import Described, Level, complex_type, joined, naming, parted
 from torchsar.io.inverse import describe_inverse
 from torchsar.io.path import describe_path
 from torchsar.io.recorded import describe_stripmap
@@ -53,7 +53,10 @@ _KINDS = {
             **{"fs_hz": "Hz", "prf_hz": "Hz", "f0_hz": "Hz", "chirp_rate_hz_s": "Hz/s", "pulse_s": "s"},
             **{"slant_range_cell1_m": "m", "v_eff_m_s": "m/s", "first_cell": "", "c_m_s": "m/s"},
         },
-        {"agc_db": ("dB", "pulse"), "line_number": ("", "pulse"), "pilot": ("", "range")},
+        {
+            **{"agc_db": ("dB", "pulse"), "line_number": ("", "pulse"), "line_time_s": ("s", "pulse")},
+            "pilot": ("", "range"),
+        },
         describe_stripmap,
     ),
     "profiles": _Kind(
@@ -97,9 +100,40 @@ _DTYPES = (
     *("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "float16", "float32", "float64"),
     *("complex64", "complex128"),
 )
-_FLAT = ("dtype", "byte_order", "header_bytes", "shape")
-_SAMPLES = ("key", "name", "dims", "imag", "conjugate", *_FLAT)
-_ENTRY = ("name", "file", "unit", "transpose", "first", "step", *_FLAT)
+# keys of a section with the types of their values, and these in words
+_Keys = Mapping[str, tuple[Any, str]]
+_BYTES = (int, "a number of bytes")
+_FLAT: _Keys = {
+    "dtype": (str, "the name of a type"),
+    "byte_order": (str, "little or big"),
+    **dict.fromkeys(("header_bytes", "line_prefix_bytes", "line_suffix_bytes"), _BYTES),
+    "shape": ((list, tuple), "a list of numbers of at least 1"),
+}
+_NAMED: _Keys = {"name": (str, "the name of an array in the file")}
+_SAMPLES: _Keys = {
+    **_NAMED,
+    "key": (str, "the name of the sample array in the archive"),
+    "dims": ((list, tuple), "the dims of the array in the order of the file"),
+    "choose": (Mapping, "a mapping of further dims to the index to read, counted from 0"),
+    "imag": (str, "the name of an array or file"),
+    "order": (str, "a group of I and Q as they follow each other in the file, such as iq or iiqq"),
+    "table": (str, "the name of an array in the file, of which samples are indices"),
+    "offset": ((int, float, list, tuple), "a number that I and Q exceed their true values by, or one for each"),
+    "conjugate": (bool, "true or false"),
+    **_FLAT,
+}
+_ENTRY: _Keys = {
+    **_NAMED,
+    "file": (str, "the name of a file"),
+    "unit": (str, "a unit"),
+    "transpose": (bool, "true or false"),
+    **dict.fromkeys(("first", "step"), ((int, float), "a number")),
+    **_FLAT,
+}
+_SECTIONS: _Keys = {
+    "system": (str, "stripmap, isal or path"),
+    **dict.fromkeys(("samples", "radar", "side"), (Mapping, "a mapping")),
+}
 
 
 def import_recording(path: str | Path, sidecar: Mapping[str, Any], out: str | Path, name: str = "sidecar") -> Path:
@@ -126,14 +160,20 @@ def import_recording(path: str | Path, sidecar: Mapping[str, Any], out: str | Pa
       of this array in the order of the file: `pulse` and `range` or, for `sig`, `fp` and `history`,
       `pulse` and `frequency`, and `iq` for a dimension with real and imaginary part. `imag` is the
       name of a second array (or flat binary file) with the imaginary part. `conjugate: true` is for
-      data with the phases exp(+2j pi f tau).
+      data with the phases exp(+2j pi f tau). Further dims have any name, and `choose`, such as
+      `{receiver: 0}`, says which of them is read. `order` is the order of I and Q along the last
+      dim iq where it is not I Q I Q, such as `iiqq`. `offset` is subtracted from I and Q, as 15.5
+      of samples of 5 bits without sign or 127.5 of bytes, and `table` is the array of the values
+      that samples are indices of.
     - `radar`: numbers by the keys that the reader takes, such as `prf_hz`.
     - `side`: arrays by the keys that the reader takes, such as `freq_hz`.
     A number or array is given by a number, a list, a text like `9.65 GHz`, the name of an array in
     the file, or a mapping with `name`, `unit` (of the numbers in the file), `file` (another file,
     relative to the folder of the data) and `transpose`, or with `first` and `step` of numbers in
     equal steps. For flat binary files `dtype`, `byte_order` (little or big), `header_bytes` and
-    `shape` take the place of `name`.
+    `shape` take the place of `name`; `line_prefix_bytes` and `line_suffix_bytes` are those before
+    and after each entry of the first dim, such as the headers of lines. A file with one array
+    needs no `name`.
 
     All keys are checked before samples are read. Samples are read and written in blocks of 32 MiB
     (or of one line, if it is longer): less than 256 MiB and the side arrays are in memory at a
@@ -161,21 +201,22 @@ def import_recording(path: str | Path, sidecar: Mapping[str, Any], out: str | Pa
         raise ValueError(f"{out}: the name of the new archive must end in .npz")
     if out.exists() or out.is_symlink():
         raise FileExistsError(f"{out} exists and is not replaced; move it, or choose another name")
-    tree = _section(sidecar, name, ("system", "samples", "radar", "side"))
+    tree = _section(sidecar, name, _SECTIONS)
     keys = _SYSTEMS[_choice(tree.get("system"), f"{name}: system", _SYSTEMS)]
     layout = _section(tree.get("samples"), f"{name}: samples", _SAMPLES)
     key = _choice(layout.get("key", keys[0] if "profiles" not in keys else None), f"{name}: samples.key", keys)
     kind = _KINDS[key]
     with ExitStack() as stack:
         file = _File(path, cache(partial(open_container, stack=stack)))
-        samples, slow = _samples(file, layout, f"{name}: samples", kind.dims)
+        samples, slow, unsigned = _samples(file, layout, f"{name}: samples", kind.dims)
         turned = slow != kind.dims[0]
         shape = samples.shape[::-1] if turned else samples.shape
         lengths, arrays, stored = dict(zip(kind.dims, shape, strict=True)), {}, {}
         sections = {"radar": {one: (unit, "") for one, unit in kind.radar.items()}, "side": kind.side}
         for section, known in sections.items():
             where, held = f"{name}: {section}", tree.get(section)
-            for one, value in _section({} if held is None else held, where, tuple(known)).items():
+            accepted = dict.fromkeys(known, (object, ""))
+            for one, value in _section({} if held is None else held, where, accepted).items():
                 unit, along = known[one]
                 x = _value(file, value, f"{where}.{one}", unit, lengths.get(along))
                 arrays[one] = x = x.reshape(()) if section == "radar" and x.size == 1 else x
@@ -185,7 +226,10 @@ def import_recording(path: str | Path, sidecar: Mapping[str, Any], out: str | Pa
         with naming(name):  # side data that only a recording checks, with one sample per line
             lines = torch.ones(lengths["pulse"], 1, dtype=torch.complex64)
             Recording.from_arrays(lines, found.radar, what=name, **found.aux)
-        write_whole(out, lambda part: _write(part, key, samples, slow, turned, arrays))
+        level = Level()
+        write_whole(out, lambda part: _write(part, key, samples, slow, turned, arrays, level))
+    if key == "iq" or unsigned:  # in a phase history a constant may be a target
+        level.warn(samples.what, f"{name}: samples.offset")
     return out
 
 
@@ -196,48 +240,102 @@ class _File(NamedTuple):
     opened: Callable[[Path], Container | None]
 
 
-def _samples(file: _File, tree: Mapping[str, Any], where: str, order: tuple[str, str]) -> tuple[BlockArray, str]:
-    """The samples as one complex array (slow, fast), in the order of the file, and the name of its
-    slow dim.
+def _samples(file: _File, tree: Mapping[str, Any], where: str, order: tuple[str, str]) -> tuple[BlockArray, str, bool]:
+    """The samples as one complex array (slow, fast), in the order of the file, the name of its slow
+    dim, and whether the numbers in the file have no sign.
     """
-    dims = tree.get("dims")
-    if not isinstance(dims, (list, tuple)) or sorted(map(str, dims)) not in (sorted(order), sorted((*order, "iq"))):
+    dims, choose = [str(one) for one in _needed(tree, "dims", where, _SAMPLES)], dict(tree.get("choose", {}))
+    further, pair = [one for one in dims if one not in (*order, "iq")], "iq" in dims
+    if not {*order} <= {*dims} or len({*dims}) < len(dims):
         raise ValueError(
-            f"{where}.dims must be the dims of the array in the order of the file, {order[0]} and {order[1]}, and "
-            f"iq if there is one for real and imaginary part, got {dims!r}"
+            f"{where}.dims must be the dims of the array in the order of the file, {order[0]} and {order[1]}, iq if "
+            f"there is one for real and imaginary part, and further ones of which choose names one index, got "
+            f"{list(tree['dims'])}"
         )
     parts = [_array(file, file.path, tree, where)]
     if "imag" in tree:
-        imag = _kept(tree, "imag", where, str, "the name of an array or file")
         flat = "dtype" in tree
-        path, layout = (file.path.parent / imag, tree) if flat else (file.path, {"name": imag})
-        parts.append(_array(file, path, layout, where))
-    kinds, pair = {part.dtype.kind for part in parts}, "iq" in dims
+        path, held = (file.path.parent / tree["imag"], tree) if flat else (file.path, {"name": tree["imag"]})
+        parts.append(_array(file, path, held, where))
+    shape, kinds = dict(zip(dims, parts[0].shape)), {part.dtype.kind for part in parts}
     for part in parts:
         if part.shape != parts[0].shape or len(part.shape) != len(dims) or 0 in part.shape:
-            raise ValueError(f"{part.what} has the shape {part.shape}, and {where}.dims are {list(dims)}")
-    if pair and (parts[0].shape[dims.index("iq")] != 2 or "c" in kinds):
+            raise ValueError(f"{part.what} has the shape {part.shape}, and {where}.dims are {dims}")
+    for one in (*further, *choose):
+        index = choose.get(one, 0 if shape.get(one) == 1 else None)
+        if one not in further or type(index) is not int or not 0 <= index < shape[one]:
+            lengths = {one: shape[one] for one in further}
+            raise ValueError(
+                f"{where}.choose must name one index, from 0, for each further dim of {lengths}, got {choose}; write "
+                "for instance " + ("choose: {" + ", ".join(f"{one}: 0" for one in further) + "}" if further else "none")
+            )
+        choose[one] = index
+    if pair and (shape["iq"] != 2 or "c" in kinds):
         raise ValueError(
             f"{where}.dims: the dim iq must have 2 real numbers, got {parts[0].dtype.name} of shape "
-            f"{parts[0].shape} for the dims {list(dims)}"
+            f"{parts[0].shape} for the dims {dims}"
         )
     if pair + len(parts) != 1 + ("c" not in kinds) or (len(parts) == 2 and "c" in kinds):
         raise ValueError(
             f"{where}: samples must be complex, or real with one dim iq or one array imag, got "
-            f"{parts[0].dtype.name} with the dims {list(dims)}{' and imag' if len(parts) == 2 else ''}"
+            f"{parts[0].dtype.name} with the dims {dims}{' and imag' if len(parts) == 2 else ''}"
         )
-    conjugate = _kept(tree, "conjugate", where, bool, "true or false", False)
-    slow = next(one for one in dims if one != "iq")
+    slow = next(one for one in dims if one in order)
+    turn, offset = _order(tree, where, dims, shape, slow), _offset(tree, where)
+    table = None if "table" not in tree else _array(file, file.path, {"name": tree["table"]}, where).read().ravel()
+    if table is not None and not kinds <= {"i", "u"}:
+        raise ValueError(f"{where}.table: samples must be whole numbers, indices of it, got {parts[0].dtype.name}")
 
     def complex_part(slices: tuple[slice, ...]) -> np.ndarray:
-        held = [part.read((slice(None),) * dims.index(slow) + slices) for part in parts]
-        real_imag = np.moveaxis(held[0], dims.index("iq"), 0) if pair else held
+        index = {**{one: slice(i, i + 1) for one, i in choose.items()}, slow: slices[0]}
+        held = [part.read(tuple(index.get(one, slice(None)) for one in dims)) for part in parts]
+        if table is not None:
+            with naming(f"{where}.table"):
+                held = [_looked_up(table, x) for x in held]
+        real_imag = turn(held[0]) if pair else held
         block = joined(*real_imag) if len(real_imag) == 2 and "c" not in kinds else held[0]
-        return np.conj(block) if conjugate else block
+        left = [one for one in dims if one != "iq"]
+        block = block.squeeze(tuple(left.index(one) for one in further)) - offset
+        return np.conj(block) if tree.get("conjugate", False) else block
 
-    shape = tuple(n for n, one in zip(parts[0].shape, dims, strict=True) if one != "iq")
-    dtype = complex_type(np.result_type(*(part.dtype for part in parts)))
-    return BlockArray(parts[0].path, parts[0].kind, parts[0].name, shape, dtype, complex_part), slow
+    types = (part.dtype if table is None else table.dtype for part in parts)
+    lengths = tuple(shape[one] for one in dims if one in order)
+    dtype = complex_type(np.result_type(*types))
+    found = BlockArray(parts[0].path, parts[0].kind, parts[0].name, lengths, dtype, complex_part)
+    return found, slow, kinds == {"u"}
+
+
+def _order(
+    tree: Mapping[str, Any], where: str, dims: list[str], shape: Mapping[str, int], slow: str
+) -> Callable[[np.ndarray], Sequence[np.ndarray]]:
+    """The function that parts I and Q, by the order in which they follow each other."""
+    order = tree.get("order", "iq")
+    if "iq" not in dims and "order" in tree:
+        raise ValueError(f"{where}.order is for samples with a dim iq, got the dims {dims}")
+    if len(order) == 2 and "iq" in dims:
+        return lambda x: parted(np.moveaxis(x, dims.index("iq"), -1), order)
+    before = dims[-2] if len(dims) > 1 else ""
+    if "order" in tree and (dims[-1] != "iq" or before == slow or before in tree.get("choose", {})):
+        raise ValueError(f"{where}.order {order!r} needs iq as the last dim, after the fast one, got {dict(shape)}")
+    with naming(f"{where}.order"):
+        parted(np.empty((shape[before], 2)), order)
+    return lambda x: parted(x, order)
+
+
+def _offset(tree: Mapping[str, Any], where: str) -> complex:
+    """What is subtracted from complex samples."""
+    given = tree.get("offset", 0)
+    both = list(given) if isinstance(given, (list, tuple)) else [given, given]
+    if len(both) != 2 or not all(type(x) in (int, float) and math.isfinite(x) for x in both):
+        raise ValueError(f"{where}.offset must be {_SAMPLES['offset'][1]}, got {given!r}")
+    return complex(*both)
+
+
+def _looked_up(table: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """Entries of a table."""
+    if index.min() < 0 or index.max() >= len(table):
+        raise ValueError(f"it has {len(table)} entries, and samples are {index.min()} to {index.max()}")
+    return table[index]
 
 
 def _array(file: _File, path: Path, tree: Mapping[str, Any], where: str) -> BlockArray:
@@ -248,22 +346,23 @@ def _array(file: _File, path: Path, tree: Mapping[str, Any], where: str) -> Bloc
         if flat:
             raise ValueError(f"{where}.{flat[0]}: {path} is a {container.kind} file; give name instead")
         with naming(where):
-            return container.array(_kept(tree, "name", where, str, "the name of an array in the file"))
+            return container.array(tree["name"] if "name" in tree else container.only())
     if "name" in tree or not flat:
         raise ValueError(
-            f"{where}: {path} is no HDF5, MATLAB or numpy file; if it is flat binary, give dtype and shape, and no name"
+            f"{where}: {path} is no HDF5, MATLAB, numpy or .csv file; if it is flat binary, give dtype and shape, and "
+            "no name"
         )
     dtype = np.dtype(_choice(tree.get("dtype"), f"{where}.dtype", _DTYPES))
     order = _choice(tree.get("byte_order", "little"), f"{where}.byte_order", ("little", "big"))
-    shape, header = tree.get("shape"), _kept(tree, "header_bytes", where, int, "a number of bytes", 0)
-    whole = isinstance(shape, (list, tuple)) and all(type(n) is int and n > 0 for n in shape)
-    if not shape or not whole or header < 0:
+    shape = tree.get("shape")
+    spare = [tree.get(key, 0) for key in ("header_bytes", "line_prefix_bytes", "line_suffix_bytes")]
+    if not shape or not all(type(n) is int and n > 0 for n in shape) or min(spare) < 0:
         raise ValueError(
-            f"{where}: shape must be a list of numbers of at least 1, and header_bytes at least 0, got {shape!r} "
-            f"and {header!r}"
+            f"{where}: shape must be a list of numbers of at least 1, and numbers of bytes at least 0, got {shape!r} "
+            f"and {spare}"
         )
     with naming(where):
-        return flat_array(path, dtype.newbyteorder("<" if order == "little" else ">"), tuple(shape), header)
+        return flat_array(path, dtype.newbyteorder("<" if order == "little" else ">"), tuple(shape), *spare)
 
 
 def _value(file: _File, value: Any, where: str, own: str, n: int | None) -> np.ndarray:
@@ -274,7 +373,7 @@ def _value(file: _File, value: Any, where: str, own: str, n: int | None) -> np.n
         value, unit = (float(match[1]), match[2]) if match else ({"name": value}, None)
     if isinstance(value, Mapping):
         tree = _section(value, where, _ENTRY)
-        unit = _kept(tree, "unit", where, str, "a unit", None)
+        unit = tree.get("unit")
         array = _steps(tree, where, n) if {"first", "step"} & set(tree) else _entry(file, tree, where)
     else:
         array = _numbers(value, where, own)
@@ -291,21 +390,34 @@ def _value(file: _File, value: Any, where: str, own: str, n: int | None) -> np.n
 
 def _entry(file: _File, tree: Mapping[str, Any], where: str) -> np.ndarray:
     """The numbers of an array in a file."""
-    other = _kept(tree, "file", where, str, "the name of a file", None)
-    path = file.path if other is None else file.path.parent / other
+    path = file.path.parent / tree["file"] if "file" in tree else file.path
     array = _array(file, path, tree, where).read()
-    return array.T if _kept(tree, "transpose", where, bool, "true or false", False) else array
+    return array.T if tree.get("transpose", False) else array
 
 
-def _section(tree: Any, where: str, accepted: Sequence[str]) -> dict[str, Any]:
-    """A mapping with no other keys than the accepted ones."""
+def _section(tree: Any, where: str, accepted: _Keys) -> dict[str, Any]:
+    """A mapping with no other keys than the accepted ones, whose values have their types."""
     if not isinstance(tree, Mapping):
         got = "nothing" if tree is None else repr(tree)
         raise ValueError(f"{where} must be a mapping with some of the keys {', '.join(accepted)}, got {got}")
-    for key in tree:
+    for key, value in tree.items():
         if key not in accepted:
             raise ValueError(f"{where}: key {key!r} is not known{did_you_mean(str(key), accepted)}")
-    return dict(tree)
+        kind, words = accepted[key]
+        if (
+            words
+            and value is not None
+            and (not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool))
+        ):
+            raise ValueError(f"{where}.{key} must be {words}, got {value!r}")
+    return {key: value for key, value in tree.items() if value is not None}
+
+
+def _needed(tree: Mapping[str, Any], key: str, where: str, keys: _Keys) -> Any:
+    """The value of a key that must be there."""
+    if key not in tree:
+        raise ValueError(f"{where} lacks the key {key!r}, {keys[key][1]}")
+    return tree[key]
 
 
 def _numbers(value: Any, where: str, unit: str) -> np.ndarray:
@@ -328,18 +440,8 @@ def _steps(tree: Mapping[str, Any], where: str, n: int | None) -> np.ndarray:
     if n is None or other:
         what = f"{other[0]} is given too" if other else "this key has no length of its own"
         raise ValueError(f"{where}: first and step cannot be used here, since {what}; give the name of an array")
-    first, step = (_kept(tree, key, where, (int, float), "a number") for key in ("first", "step"))
+    first, step = (_needed(tree, key, where, _ENTRY) for key in ("first", "step"))
     return first + step * np.arange(n, dtype=np.float64)
-
-
-def _kept(tree: Mapping[str, Any], key: str, where: str, kind: Any, accepted: str, default: Any = ...) -> Any:
-    """The value of a key, of a given type."""
-    value = tree.get(key, default)
-    if value is ...:
-        raise ValueError(f"{where} lacks the key {key!r}, {accepted}")
-    if key in tree and (not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool)):
-        raise ValueError(f"{where}.{key} must be {accepted}, got {value!r}")
-    return value
 
 
 def _choice(value: Any, where: str, accepted: Sequence[str] | Mapping[str, Any]) -> str:
@@ -359,7 +461,13 @@ def _stream(array: np.ndarray) -> IO[bytes]:
 
 
 def _write(
-    path: Path, key: str, samples: BlockArray, slow: str, turned: bool, arrays: Mapping[str, np.ndarray]
+    path: Path,
+    key: str,
+    samples: BlockArray,
+    slow: str,
+    turned: bool,
+    arrays: Mapping[str, np.ndarray],
+    level: Level,
 ) -> None:
     """Write the archive; the samples (slow, fast) are stored in the order of the file they come
     from, which is turned where the slow dim is the second one of the array in the archive.
@@ -382,4 +490,5 @@ def _write(
                         f"{samples.what}: {bad} samples are NaN or Inf at indices {first} to {first + len(block) - 1} "
                         f"of the dim {slow!r}; set missing samples to zero"
                     )
+                level.add(block)
                 member.write(np.ascontiguousarray(block).data)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +16,10 @@ from torchsar.core import Axis, Recording, Signal
 from torchsar.focus.detection import QuickLook
 from torchsar.io.arrays import put
 from torchsar.io.extras import library, reading
-from torchsar.io.fields import archive, naming
+from torchsar.io.fields import Level, archive, naming
 from torchsar.io.recorded import describe_stripmap
 from torchsar.io.seal import canonical, group_attributes, sealed
+from torchsar.repair.placing import LinePlan
 
 # number of the layout of the store; another one is refused
 _FORMAT = 1
@@ -25,7 +28,7 @@ _CHUNK_SAMPLES = 4096
 # bytes of samples that are read at once from an image, by choice
 _PART_BYTES = 32 << 20
 # side data with one entry per line
-_PER_LINE = ("agc_db", "line_number")
+_PER_LINE = ("agc_db", "line_number", "line_time_s", "window_start_m")
 
 
 class StripRecording:
@@ -35,9 +38,13 @@ class StripRecording:
         path: Path of the archive, written without compression, such as by `torchsar import`.
         dtype: complex64 or complex128, dtype of the samples.
 
+    Lines with numbers, times or window starts of their own are put on a regular grid, as
+    `regular_lines` does.
+
     Attributes:
         radar: Radar of the recording.
         shape: Numbers of lines and samples.
+        notes: What was done with the lines.
         axes: Axes of the raw matrix, (pulse, range).
 
     Raises:
@@ -49,14 +56,18 @@ class StripRecording:
         self.path, self.dtype = Path(path), dtype
         found = describe_stripmap(archive(self.path, "raw stripmap data"), self.path)
         self._held, self.radar = found, found.radar
-        self.shape: tuple[int, int] = found.samples.shape[:2]  # pyright: ignore[reportAttributeAccessIssue]
-        self.axes = self.radar.raw_axes(*self.shape)
+        lines, samples = found.samples.shape[:2]
         for name in _PER_LINE:
-            if name in found.aux and found.aux[name].shape != self.shape[:1]:
-                raise ValueError(
-                    f"{path}: {name} must have one entry per line, {self.shape[0]}, got {found.aux[name].shape}"
-                )
-        found.samples.rows(0, 1)
+            if name in found.aux and found.aux[name].shape != (lines,):
+                raise ValueError(f"{path}: {name} must have one entry per line, {lines}, got {found.aux[name].shape}")
+        with naming(self.path):
+            side = {name: torch.as_tensor(x) for name, x in found.aux.items() if name in _PER_LINE}
+            self._plan = plan = LinePlan.of(self.radar, side, lines)
+        self.shape = (lines, samples) if plan is None else (plan.rows, samples + plan.further_samples)
+        self.axes, self.notes = self.radar.raw_axes(*self.shape), () if plan is None else plan.notes
+        level = Level()
+        level.add(found.formed(found.samples.rows(0, min(lines, 64))))  # pyright: ignore[reportArgumentType]
+        level.warn(str(path), "offset")
 
     def recording(self, first: int, last: int) -> Recording:
         """Read some of the lines.
@@ -71,6 +82,27 @@ class StripRecording:
         Raises:
             ValueError: If a sample or side data are not valid, as for `read_stripmap`.
         """
+        if self._plan is None:
+            return self._recorded(first, last)
+        start, stop = self._plan.needed(first, last)
+        held = self._recorded(start, stop)
+        rows = self._plan.placed(self._plan.aligned(held.signal.data, start), start, first, last, self._turns)
+        aux = {name: x for name, x in held.aux.items() if name not in _PER_LINE}
+        if "line_number" in held.aux:
+            aux["line_number"] = torch.arange(first, last)
+        pulse = self.axes[0].part(first, last)
+        return replace(held, signal=replace(held.signal, data=rows, axes=(pulse, self.axes[1])), aux=aux)
+
+    @cached_property
+    def _turns(self) -> float:
+        """Doppler centroid about which lines are interpolated, from lines in the middle."""
+        assert self._plan is not None
+        n = len(self._plan.time)
+        start, stop = max(0, n // 2 - 1024), min(n, n // 2 + 1024)
+        return self._plan.doppler_turns(self._plan.aligned(self._recorded(start, stop).signal.data, start), start)
+
+    def _recorded(self, first: int, last: int) -> Recording:
+        """Lines as they were recorded."""
         aux = {name: x[first:last] if name in _PER_LINE else x for name, x in self._held.aux.items()}
         with naming(self.path):
             data = self._held.formed(self._held.samples.rows(first, last))

@@ -9,7 +9,8 @@ ladar with triangular sweeps           `TriangularLadar`; `sweep_middles` for th
                                        sweeps
 distant transmitter, several channels  `BistaticRadar`; `range_coefficients` for the transmit range
 antennas on any path                   `AntennaPath`; `StraightTrack` for the nominal path
-positions from navigation              `resample_path` to the times of the pulses
+positions from navigation              `read_track` reads a motion log as a `Track`;
+                                       `resample_path` to the times of the pulses
 spotlight or turntable geometry        `Spotlight`, exact; `FarField`, plane waves; `geometry_of`
                                        from a recording
 frequency samples, range profiles      `range_profiles` and `frequency_samples` change one into the
@@ -40,6 +41,7 @@ from torchsar.radar.spotlight import (
 from torchsar.radar.straight_track import StraightTrack
 from torchsar.radar.stripmap import StripmapRadar
 from torchsar.radar.timing import TimingDiagram, timing_diagram
+from torchsar.radar.track import Track, read_track
 from torchsar.radar.waveform import LinearFM
 
 __all__ = [
@@ -56,12 +58,14 @@ __all__ = [
     "StraightTrack",
     "StripmapRadar",
     "TimingDiagram",
+    "Track",
     "TriangularLadar",
     "frequency_samples",
     "geocentric",
     "geometry_of",
     "range_coefficients",
     "range_profiles",
+    "read_track",
     "resample_path",
     "seen_point",
     "sweep_middles",

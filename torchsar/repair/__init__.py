@@ -5,7 +5,8 @@ A line is the record of one pulse along range.
 ==================================  ================================================================
 impairment                          what to use
 ==================================  ================================================================
-line numbers, irregular lines       `line_integrity`, first of all
+line numbers, irregular lines       `line_integrity`, first of all; `regular_lines` of a recording
+                                    whose numbers, times or window starts are right
 missing lines                       `sparse_fill`; faster and less exact `band_limited_fill`,
                                     `linear_fill`, `zero_fill`
 narrowband interference             `subtract_interference`; `notch_interference`;
@@ -53,6 +54,7 @@ from torchsar.repair.jitter import (
 from torchsar.repair.jitter_blind import BlindJitter, estimate_jitter_blind
 from torchsar.repair.jitter_pilot import PilotJitter, estimate_jitter_pilot
 from torchsar.repair.lines import LineIntegrity, line_integrity
+from torchsar.repair.placing import regular_lines
 from torchsar.repair.response import CorrectResponse, correct_response
 from torchsar.repair.response_phase import (
     EstimateFlatResponse,
@@ -111,6 +113,7 @@ __all__ = [
     "line_integrity",
     "linear_fill",
     "notch_interference",
+    "regular_lines",
     "sparse_fill",
     "subtract_interference",
     "zero_fill",

@@ -18,7 +18,7 @@ moving targets, several channels  `BistaticWorld`; gain `Pattern` or `BandLimite
                                   `PolynomialTransmit`
 world seen from any path          `PathWorld` with a `Flight`, its `Navigation`, a `PlaneGround` and
                                   a `SideBeam`
-path of an antenna                `StraightPath` or `CircularPath`; deviations `Sway`, with
+path of an antenna                `StraightPath`, `CircularPath`, `RecordedPath`; `Sway`, with
                                   `Jitter`, `RandomWalk`, `Offset` and the motions below
 point targets                     `Points`, `RandomPoints`; `Together` joins a `Scene` with others;
                                   they become `Scatterers`
@@ -47,7 +47,17 @@ from torchsar.scene.bistatic import (
     PolynomialTransmit,
     TaylorRange,
 )
-from torchsar.scene.flight import CircularPath, Flight, Jitter, Navigation, Offset, RandomWalk, StraightPath, Sway
+from torchsar.scene.flight import (
+    CircularPath,
+    Flight,
+    Jitter,
+    Navigation,
+    Offset,
+    RandomWalk,
+    RecordedPath,
+    StraightPath,
+    Sway,
+)
 from torchsar.scene.fluctuation import LogAmplitude, MeasuredTrack, PathFluctuation, VibrationSpectrum
 from torchsar.scene.ladar import CalibrationFibre, LadarWorld
 from torchsar.scene.ladar_range import EverySample, LinearInSweep, OnePerPeriod, OnePerSweep, QuadraticInSweep
@@ -106,6 +116,7 @@ __all__ = [
     "QuadraticInSweep",
     "RandomPoints",
     "RandomWalk",
+    "RecordedPath",
     "RetroAndBrokenLine",
     "Satellite",
     "Scatterers",

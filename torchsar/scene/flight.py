@@ -12,13 +12,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Spline, per_trial
 from torchsar.radar.navigation import resample_path
+from torchsar.radar.track import Track
 from torchsar.scene.fluctuation import MeasuredTrack, RandomMotion, drawn_motion
 from torchsar.scene.trials import finite_numbers, refuse_other_trials, refuse_unless
 from torchsar.scene.vibration import Motion, displacement_m
@@ -108,6 +109,41 @@ class CircularPath(NominalPath):
         angle = self.start_rad + self.rate_rad_s * time_s
         x, y = self.radius_m * torch.cos(angle), self.radius_m * torch.sin(angle)
         return torch.stack([x, y, torch.full_like(x, self.height_m)], -1)
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedPath(NominalPath):
+    """Path of a motion log, between whose records cubic splines interpolate.
+
+    >>> import torch
+    >>> from torchsar import radar, scene
+    >>> time_s = torch.arange(10.0, 16.0).double()
+    >>> position_m = torch.stack([0 * time_s - 900.0, 50 * time_s, 0 * time_s + 500.0], -1)
+    >>> path = scene.RecordedPath(radar.Track(time_s, position_m))
+    >>> path.position_m(torch.tensor([0.0, 0.5], dtype=torch.float64)).tolist()
+    [[-900.0, 500.0, 500.0], [-900.0, 525.0, 500.0]]
+
+    Args:
+        track: Recorded positions, as `radar.read_track` returns them.
+        start_s: Time of the first pulse on the clock of the log in seconds; None for that of the
+            first record.
+
+    Raises:
+        TypeError: If there is no track.
+        ValueError: From `position_m`, if pulses lie beyond the log, or it has gaps or jumps, see
+            `resample_path`.
+    """
+
+    track: Any  # a Track, which all trials share
+    start_s: float | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.track, Track):
+            raise TypeError(f"a RecordedPath needs a Track, as radar.read_track returns it, got {self.track!r:.80}")
+
+    def position_m(self, time_s: Tensor) -> Tensor:
+        clock, place = (x.to(time_s.device) for x in (self.track.time_s, self.track.position_m))
+        return resample_path(clock, place, time_s + (float(clock[0]) if self.start_s is None else self.start_s))
 
 
 @dataclass(frozen=True)
@@ -267,12 +303,22 @@ class Flight:
     [[-1000.0, -50.0, 500.0], [-1000.0, 0.0, 500.5]]
 
     Args:
-        nominal: Nominal path.
+        nominal: Nominal path, an object with the method `position_m` of `NominalPath`.
         motion: Deviation from it.
+
+    Raises:
+        TypeError: If they are objects of another kind.
     """
 
     nominal: NominalPath
     motion: Sway = field(default_factory=Sway)
+
+    def __post_init__(self) -> None:
+        if not callable(getattr(self.nominal, "position_m", None)) or not isinstance(self.motion, Sway):
+            raise TypeError(
+                "a Flight needs a path with position_m(time_s), such as StraightPath or RecordedPath, and a Sway, got "
+                f"{type(self.nominal).__name__} and {type(self.motion).__name__}"
+            )
 
     def drawn(self, draws: Draws, span_s: float) -> Flight:
         """Draw the random motions.

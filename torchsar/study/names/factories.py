@@ -17,10 +17,10 @@ from torchsar.compensate import Autofocus, EffectiveVelocity, RotationAutofocus,
 from torchsar.compensate.pulse_phase import CorrectPulsePhase
 from torchsar.core import Alternate, Turn
 from torchsar.focus import OmegaK, PaddedLines, TargetImage
-from torchsar.io.plain import read_array, read_track
-from torchsar.radar import LIGHT_M_S, FarField, InverseRadar, Spotlight, StripmapRadar
+from torchsar.io.plain import measured_displacement, read_array
+from torchsar.radar import LIGHT_M_S, FarField, InverseRadar, Spotlight, StripmapRadar, read_track
 from torchsar.repair import BandLimited, CorrectJitter, Lagrange
-from torchsar.scene import Dechirped, ImageReflectivity, KSea, MeasuredTrack, Polynomial
+from torchsar.scene import Dechirped, ImageReflectivity, KSea, MeasuredTrack, Polynomial, RecordedPath
 
 
 def effective_velocity(
@@ -190,11 +190,27 @@ def measured_track(file: str) -> MeasuredTrack:
             (separated by commas or blanks, a line of names is allowed), .npy file of shape (n, 2),
             or .npz file with `time_s` (n,) and `displacement_m` (..., n).
     """
-    time_s, displacement_m = (torch.as_tensor(x, dtype=torch.float64) for x in read_track(file))
+    time_s, displacement_m = (torch.as_tensor(x, dtype=torch.float64) for x in measured_displacement(file))
     try:
         return MeasuredTrack(time_s, displacement_m)
     except ValueError as problem:
         raise ValueError(f"{file}: {problem}") from None
+
+
+def recorded_path(file: str, origin: Sequence[float] | None = None, start_s: float | None = None) -> RecordedPath:
+    """Path of a motion log, between whose records cubic splines interpolate.
+
+    Args:
+        file: Table (.csv, text, .npz) with the columns time, x, y, z in s and m, or time, latitude,
+            longitude, height in s, degrees and m, see `torchsar.radar.read_track`.
+        origin: Origin of the coordinates of the world: x, y, z, or latitude, longitude, height;
+            null for that of the log, or the place of its first record at height 0.
+        start_s: Time of the first pulse on the clock of the log; null for the first record.
+    """
+    try:
+        return RecordedPath(read_track(file, origin), start_s)
+    except OSError as error:
+        raise ValueError(str(error)) from None
 
 
 def image_sea(

@@ -52,7 +52,11 @@ FLIGHT_MOTIONS = Catalogue(
     "kind",
     {**RADIAL_MOTIONS.entries, "offset": scene.Offset, "jitter": scene.Jitter, "random_walk": scene.RandomWalk},
 )
-NOMINAL_PATHS = Catalogue("nominal path", "kind", {"straight": scene.StraightPath, "circular": scene.CircularPath})
+NOMINAL_PATHS = Catalogue(
+    "nominal path",
+    "kind",
+    {"straight": scene.StraightPath, "circular": scene.CircularPath, "recorded": factories.recorded_path},
+)
 GROUNDS = Catalogue("ground", "kind", {"plane": scene.PlaneGround})
 START_PHASES = Catalogue("start phase", "kind", {"normal": scene.StartPhase, "uniform": scene.UniformStartPhase})
 FIDELITIES = Catalogue("fidelity", "kind", {"phase_only": scene.PhaseOnly, "dechirped": factories.dechirped})

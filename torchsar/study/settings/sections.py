@@ -24,9 +24,13 @@ LONGEST_NAME = 60
 
 
 class Data(Strict):
-    """Recorded data instead of a simulated world; `impairments` are added to the recording."""
+    """Recorded data instead of a simulated world; `impairments` are added to the recording.
+
+    `channel` is that of a file with several, such as CPHD.
+    """
 
     file: str | None = None
+    channel: str | None = None
     impairments: dict[str, Any] = {}
 
 

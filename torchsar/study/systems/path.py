@@ -383,7 +383,9 @@ class AnyPath(System):
             else (AntennaPath.recorded(bench.recording.aux), bench.recording.aux["frequency_hz"])
         )
         images = {name: last_image(chain.stages.values()) for name, chain in bench.chains.items()}
-        return by_limit((at, name) for name, one in images.items() if one for at in one.sampling_limits(*geometry))
+        found = by_limit((at, name) for name, one in images.items() if one for at in one.sampling_limits(*geometry))
+        beam = None if bench.recording is not None else bench.world().beam
+        return found if beam is None else {**found, _band_limit(bench.radar, geometry[0], beam): list(images)}
 
     def choices(self, bench: Bench) -> Sequence[Choice]:
         stage = last_image(bench.chains["recommended"].stages.values())
@@ -427,6 +429,23 @@ class AnyPath(System):
         every = [*compensated, *alternatives, Alternative("direct sum", {"stage": "direct_image"}, {})]
         measured = partial(_measured, bench, geometry, {**straight, **tiles}, stage)
         return [Choice("image", "stage", every, measured)]
+
+
+def _band_limit(radar: InverseRadar, antennas: AntennaPath, beam: SideBeam) -> Limit:
+    """The limit of the pulse rate, below which the Doppler band of the beam folds."""
+    place = antennas.places[-1].detach().reshape(-1, antennas.pulses, 3).mean(0)
+    speed = float(torch.linalg.vector_norm(place.diff(dim=0), dim=-1).mean()) * radar.prf_hz
+    width = math.radians(float(torch.as_tensor(beam.width_deg).max()))
+    return Limit(
+        "the pulse rate, against the half-power Doppler band of the beam",
+        radar.prf_hz,
+        4 * speed / radar.wavelength_m * math.sin(width / 2),
+        "Hz",
+        "warn",
+        "the band folds, so that ghosts appear in azimuth",
+        "raise radar.prf_hz, fly slower, or narrow the beam",
+        at_least=True,
+    )
 
 
 def _measured(

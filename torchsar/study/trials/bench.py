@@ -79,7 +79,12 @@ class Bench:
 
     def _read(self) -> Recording:
         try:
-            return self.system.read(self.config.data.file, self.dtype)
+            channel = self.config.data.channel
+            if channel is None:
+                return self.system.read(self.config.data.file, self.dtype)
+            if self.system.name != "path":
+                raise ValueError(f"only recordings of the system path have channels, got data.channel={channel!r}")
+            return self.system.read(self.config.data.file, self.dtype, channel)  # pyright: ignore[reportCallIssue]
         except (ValueError, OSError, ModuleNotFoundError) as error:
             text = one_line(error).removeprefix("data.file: ")
             raise ConfigError(f"{self.file}: data.file: {text}") from None

@@ -301,7 +301,7 @@ class Stripmap(System):
     settings = {"islr_extent_nulls": "sidelobe_nulls", "reference": "reference"}
     draw_case = figures.DRAW_CASE
     plain_names = True
-    read = staticmethod(read_stripmap)  # pyright: ignore[reportAssignmentType]
+    read = staticmethod(partial(read_stripmap, regular=True))  # pyright: ignore[reportAssignmentType]
 
     def samples(self, world: Strip, radar: StripmapRadar) -> int:
         return world.lines * world.samples
