@@ -36,8 +36,8 @@ SENSOR = StripmapRadar(
     pointing_doppler_hz=0.0,
     integration_s=1.5,
 )
-# integration time (s), middle of the swath, length of the synthetic aperture, half the frame (m)
-DWELL_S, RANGE_M, APERTURE_M, HALF_FRAME_M = 1.5, 700e3, 7000.0 * 1.5, 5000.0
+# integration time (s) and middle of the swath (m)
+DWELL_S, RANGE_M = 1.5, 700e3
 # lines and samples of frame and aperture or pulse, in the full and the reduced form
 SIZES = {False: (11_720, 17_500), True: (7_000, 1_400)}
 
@@ -108,8 +108,24 @@ def _text_1(seen: _Frame, path: Path) -> list[Check]:
     ]
 
 
+def _half_aperture_m() -> float:
+    return SENSOR.velocity_m_s * DWELL_S / 2
+
+
+def migration_change_m(over_m: float = 5000.0) -> float:
+    """Compute by how much the range migration changes over a range.
+
+    Args:
+        over_m: The range in metres, by default half the frame.
+
+    Returns:
+        The change in metres.
+    """
+    return _half_aperture_m() ** 2 * over_m / (2 * RANGE_M**2)
+
+
 def _parabola() -> Check:
-    rest = (APERTURE_M / 2) ** 4 / (8 * RANGE_M**3)
+    rest = _half_aperture_m() ** 4 / (8 * RANGE_M**3)
     phase = 4 * math.pi / SENSOR.wavelength_m * rest
     claim = "enough for 1 to 1.5 s"
     return statement("parabola of the range", claim, phase < math.pi / 4, f"{phase:.3f} rad are left at the ends")
@@ -117,7 +133,7 @@ def _parabola() -> Check:
 
 def _velocity_error() -> float:
     """Error of the velocity that leaves pi / 4 at the ends of the aperture."""
-    quadratic = 4 * math.pi / SENSOR.wavelength_m * (APERTURE_M / 2) ** 2 / (2 * RANGE_M)
+    quadratic = 4 * math.pi / SENSOR.wavelength_m * _half_aperture_m() ** 2 / (2 * RANGE_M)
     return math.pi / 4 * SENSOR.velocity_m_s / (2 * quadratic)
 
 

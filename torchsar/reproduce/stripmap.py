@@ -298,7 +298,7 @@ def _figure_9(strips: list[_Strip], path: Path) -> list[Check]:
 def _step_3a(strips: list[_Strip], path: Path) -> list[Check]:
     """Change of the migration over half the published frame, and effect on a short strip."""
     stolt = OmegaKStolt(RADAR, reference="flat", doppler_hz=DOPPLER_HZ)(strips[0].recording.signal)
-    change = frame.APERTURE_M**2 * frame.HALF_FRAME_M / (8 * frame.RANGE_M**2)
+    change = frame.migration_change_m()
     quarter = frame.SENSOR.wave_speed_m_s / (8 * frame.SENSOR.pulse.bandwidth_hz)
     ours = (
         f"not required in the frame of Text 1: the migration changes by {change:.2f} m over it, a quarter of a cell is "

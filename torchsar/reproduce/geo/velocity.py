@@ -178,12 +178,13 @@ def _table_2(seen: Columns, path: Path) -> Made:
     plot.save(plot.error_curves(parts, "raw SCNR (dB)", "mean |error| of u_r (m/s)", log_y=True), path)
     shares = [100 * float((column["SIR"] <= theirs).double().mean()) for theirs, column in worse]
     two = [float(column["SIR, two bands"].mean()) / theirs for theirs, column in worse]
-    cells = Fact("cells", len(worse), least=1, most=3)
+    lowest = next(columns[0] for columns in seen[0].values() if "recommended" in columns[0])["recommended"]
     return [
         *checks,
-        cells,
+        Fact("cells", len(worse), least=1, most=3),
         Fact("least share", min(shares, default=0), 5),
         Fact("two bands", max(two, default=9), 0, 1),
+        Fact("recommended", float(lowest.mean()), TRUE_M_S / 2, RADAR.ambiguous_velocity_m_s / 2),
     ]
 
 
@@ -204,7 +205,8 @@ ITEMS = (
         "in {cells:.0f} cells the mean error with three bands, which are poorly conditioned at these pulse rates, is "
         "above the tolerance; the published errors there are of a single trial each, and {least share:.0f} % or more "
         "of our trials err by no more; with two bands the mean error is {two bands:.2f} times the published one or "
-        "less",
+        "less; the recommended estimator, which searches all velocities up to 21.6 m/s, errs by {recommended:.1f} m/s "
+        "at -50 dB, below its threshold",
     ),
     Item("Table 3", "errors of the slant-range velocity over the velocity", _over_velocity, _table_3),
 )

@@ -141,8 +141,8 @@ def _figure_19(seen: list[_Seen], path: Path) -> Made:
     }
     plot.save(plot.images(shown, 40, percentile=100), path)
     rates, genetic = (_each(seen, method, "omega_rad_s") for method in ("alternation", "genetic"))
-    shape = ("k1_per_s", "k2_per_s2")
-    worst = max(abs(x / float(seen[0].true[k]) - 1) for k in shape for x in _each(seen, "alternation", k))
+    shape = zip(("k1_per_s", "k2_per_s2"), seen[0].true["warp_k"].tolist(), strict=True)
+    worst = max(abs(x / true - 1) for name, true in shape for x in _each(seen, "alternation", name))
     return [
         number("alternation: rate (deg/s)", 10.0, [math.degrees(rate) for rate in rates], 1.0),
         statement("alternation: k1 and k2", "near the true ones", worst < 0.1, f"{100 * worst:.1g} % off", len(seen)),

@@ -34,7 +34,6 @@ TRUE_K = torch.tensor(WARP_K, dtype=torch.float64)
 PLACES_M, RANGE_M = (-12.0, 0.0, 12.0), 12.0
 CELLS_M = (3.4, 6.0, 12.0)  # ranges of the single cells of figure 1
 FINE = 16  # lines of a profile per Doppler cell
-REACH_M = 5.0  # to either side of a point, for the peak of its profile
 # of a fit of second order to the phase by least squares; least entropy gives 20.05
 SECOND_K1 = 20.8
 NAMES = {
@@ -146,7 +145,7 @@ def _shown(names: Sequence[str], reach_m: Sequence[float]) -> Callable[[dict[str
         _draw_profiles(profiles, names, reach_m, path)
         checks = []
         for x in (PLACES_M[-1], PLACES_M[1]):
-            peaks = [20 * math.log10(profiles[name].near(x, REACH_M).amplitude.max()) for name in names]
+            peaks = [20 * math.log10(profiles[name].near(x, 5.0).amplitude.max()) for name in names]
             rising = peaks == sorted(peaks) and abs(peaks[-1]) < 0.1
             claim = "focused best by the last of the compensations"
             words = "; ".join(f"{NAMES[name]}: peak {peak:.1f} dB" for name, peak in zip(names, peaks, strict=True))

@@ -33,7 +33,7 @@ from torchsar.focus.image_lines import mean_rate
 from torchsar.metrics import entropy, impulse_response
 from torchsar.radar import InverseRadar
 from torchsar.reproduce.isal_rotation.common import focused, in_metres, known_of, ladar, second_order
-from torchsar.reproduce.isal_rotation.profiles import OMEGA_RAD_S, WARP_K
+from torchsar.reproduce.isal_rotation.profiles import OMEGA_RAD_S, SNR_DB, WARP_K
 from torchsar.reproduce.item import Check, Item, falling, misprint, number, seeds_of, statement
 from torchsar.scene import PolynomialRotation, Satellite, TurntableWorld
 
@@ -42,7 +42,6 @@ ROTATION = PolynomialRotation(OMEGA_RAD_S, WARP_K)
 TIP_M = 6.43
 # chosen: pulse rate, pulses, cells, cell size, scatterers, chirplets, in the full and reduced forms
 SIZES = {False: (500e3, 10000, 32, 0.24, 300, 16), True: (50e3, 1000, 32, 0.24, 60, 4)}
-SNR_DB = 20.0
 # lines per Doppler cell of the images of Newton's method
 LINES_PER_CELL = 8.0
 # estimates of the genetic algorithm in the text (rad/s, 1/s, 1/s2), and tolerances

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import math
 
-from torchsar.reproduce.item import Item, Paper, given, in_order, number, statement
+from torchsar.reproduce.item import Check, Item, Paper, given, in_order, number, statement
 from torchsar.reproduce.sal import ground, letter, points
 
 __all__ = ["PAPER"]
 __dir__ = __all__.copy
-# phase of a micrometre of radial motion
-PHASE_RAD = 4e-6 * math.pi * points.RADAR.carrier_hz / points.RADAR.wave_speed_m_s
+
+
+def _micrometre() -> Check:
+    phase = 4e-6 * math.pi * points.RADAR.carrier_hz / points.RADAR.wave_speed_m_s
+    return statement("motion of a micrometre", "spoils the focus", phase > math.pi / 4, f"{phase:.1f} rad")
+
 
 PAPER = Paper(
     "sal",
@@ -31,7 +35,7 @@ PAPER = Paper(
         given(
             "Text 2",
             "sensitivity to radial motion (section 1)",
-            statement("motion of a micrometre", "spoils the focus", math.pi / 4 < PHASE_RAD, f"{PHASE_RAD:.1f} rad"),
+            _micrometre(),
         ),
         given(
             "Text 3",
