@@ -237,22 +237,20 @@ NAMED = {
 }
 
 
-# largest difference of a figure from that of a case, over its largest value, in double precision: in single
-# precision the search of a rotation ends where rounding lets it, which differs with the processor
+# largest difference of a figure from that of a case, over its largest value, in double precision:
+# in single precision a rotation search ends where rounding lets it, which differs by processor
 SAME = 1e-6
 
 
 def loaded(
     system: str, folder: Path, world: Mapping[str, Any] | None = None, cheap: bool = False, **top: Any
 ) -> Loaded:
-    """The tiny config of a system, with changes of its world and keys of the top, such as a sweep."""
+    """The tiny config of a system, with changes of its world and of other sections."""
     radar, own, stages, image = CONFIGS[system]
     processor = {"recommended": {"stages": image if cheap else stages}}
     tree = {"system": system, "title": "tiny", "seed": 3, "radar": radar, "world": {**own, **(world or {})}}
     path = folder / "tiny.yaml"
-    path.write_text(
-        yaml.safe_dump({**tree, "processor": processor, **top}, sort_keys=False), encoding="utf-8"
-    )
+    path.write_text(yaml.safe_dump({**tree, "processor": processor, **top}, sort_keys=False), encoding="utf-8")
     return load(path)
 
 

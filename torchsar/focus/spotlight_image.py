@@ -57,9 +57,9 @@ def scene_grid(
     the image. Without corners the centre is
     - the origin, if the reference paths follow the path over it;
     - the middle of a closed path, such as a circle, whose references do not;
-    - else the middle of the range window, abeam of the path: towards +x, or, of a path along x, to
-      the right of the motion. The window begins at the radar if the reference is nearer than half
-      of it.
+    - else the middle of the range window, abeam of the path: on the side of the origin, if the
+      path passes it at a distance, else towards +x, or, of a path along x, towards +y. The window
+      begins at the radar if the reference is nearer than half of it.
     Without corners the image has the width of the window, and is as long in azimuth, or as long as
     the path. The range axis is the mean horizontal direction in which the path grows, or x where
     there is none. The spacing is 1 / 1.25 of the finer resolution cell, the inverse of the extent
@@ -161,7 +161,7 @@ def _abeam(antennas: AntennaPath, window_m: float, told: bool) -> tuple[Tensor, 
     along = place[-1, :2] - place[0, :2]
     along = along / along.norm().clamp_min(1e-12)
     side = torch.stack([along[1], -along[0], along.new_zeros(())])
-    side = -side if float(side[0]) < -0.5 else side
+    side = -side if float(side[0] if abs(float(side[0])) > 0.5 else side[1]) < 0 else side
     toward = -place.mean(0) * (1 - along.new_tensor([0.0, 0.0, 1.0]))
     # the origin tells the side, if the path passes it at a distance
     if float((toward @ side).abs()) > 0.1 * window_m:
