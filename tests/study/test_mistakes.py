@@ -108,7 +108,7 @@ MISTAKES = [
         {"world": world("isal", impairments={"lost": {"kind": "lost_lines", "count": 3}})},
         "did you mean 'lost_pulses'",
     ),
-    ("isal", {"radar": radar("isal", carrier_hz=1e-300)}, "waves short enough to show the shape of a target"),
+    ("isal", {"radar": radar("isal", carrier_hz=1e-300)}, "should be 2e+07 Hz to 1e+16 Hz"),
     # isal_rotation
     ("isal_rotation", {"radar": radar("isal_rotation", carrier_hz=1.9e14)}, "give one of carrier_hz and wavelength_m"),
     ("isal_rotation", {"radar": radar("isal_rotation", wavelength_m=None)}, "give one of carrier_hz and wavelength_m"),
@@ -190,7 +190,7 @@ MISTAKES = [
         {"world": world("sal", motion={"drift": {"kind": "drift", "velocity_m_s": float("nan")}})},
         "it should be a finite number",
     ),
-    ("sal", {"world": world("sal", **points([0.0], [-4000.0]))}, "the Doppler band of the scene over the period rate"),
+    ("sal", {"world": world("sal", **points([0.0], [-4000.0]))}, "lies behind the ladar"),
     ("sal", {"world": world("sal", **points([0.0], [100.0]))}, "beat frequencies that alias"),
     (
         "sal",

@@ -273,7 +273,7 @@ def checked(tree: Any, system: Any, file: str) -> Config:
     _check_source(config, system, file)
     sections = {name: getattr(config, name) for name in system.sections}
     made = {n: None if tree is None else system.sections[n].check(tree, n, file) for n, tree in sections.items()}
-    refuse_implausible(config.system, made["radar"], made["world"], file)
+    refuse_implausible(system.magnitudes, made["radar"], made["world"], file)
     found = config.data.impairments
     kept = {n: system.impairments.check(entry, f"data.impairments.{n}", file) for n, entry in found.items()}
     methods = {name: _method(method, f"processor.{name}", system, file) for name, method in config.processor.items()}

@@ -16,6 +16,7 @@ from torchsar.focus.requirements import Limit, Requirement
 from torchsar.study.names.registry import stages
 from torchsar.study.output.pictures import Drawn, comparisons
 from torchsar.study.settings.cases import ALL, titled, word_of
+from torchsar.study.settings.plausible import MAGNITUDES, Magnitudes
 from torchsar.study.settings.sections import Loaded
 from torchsar.study.settings.signature import Catalogue, Section
 from torchsar.study.trials.batch import IMAGE, Batch, Found, Judged, Processed, Result, Trials
@@ -100,6 +101,8 @@ class System(ABC):
         columns: Metrics in reports.
         target_columns: Metrics of named targets in reports.
         tolerance: Default of the largest acceptable loss, by metric.
+        magnitudes: Units and accepted magnitudes of the numbers of radar and world, by the ending
+            of their keys.
         exact: For each key that may be `auto` (see `Choice.at`), the keys and values that select
             the exact alternative.
         images: Axes of signals that are images.
@@ -124,6 +127,7 @@ class System(ABC):
     columns: ClassVar[Mapping[str, Column]]
     target_columns: ClassVar[Mapping[str, Column]] = {}
     tolerance: ClassVar[Mapping[str, float]] = {}
+    magnitudes: ClassVar[Magnitudes] = MAGNITUDES
     exact: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
     images: ClassVar[Sequence[tuple[str, ...]]] = (IMAGE,)
     settings: ClassVar[Mapping[str, str]] = {}
