@@ -17,7 +17,7 @@ import torch
 
 from torchsar.core import Draws, Source, device_fault
 from torchsar.metrics.intervals import half_width_ratio
-from torchsar.study.montecarlo.engines import Engine, Task, engine, refuse_unguarded
+from torchsar.study.montecarlo.engines import Engine, Task, engine
 from torchsar.study.montecarlo.fingerprint import fingerprint, name_of
 from torchsar.study.montecarlo.grid import Grid, make_grid
 from torchsar.study.montecarlo.record import OK, OUTCOME, Record
@@ -220,8 +220,6 @@ def sweep(
             open file or a lock.
         Interrupted: After Ctrl-C; finished trials are recorded in `out`, if that is given.
     """
-    if workers is not None:
-        refuse_unguarded()
     for name, good, expected, given in (
         ("trial", callable(trial), "be a function of (parameters, draws)", trial),
         ("stop", stop is None or isinstance(stop, Stop), "be a Stop, such as Stop('error_m', 0.05)", stop),
