@@ -341,7 +341,7 @@ def test_doubtful_recordings_are_named_in_a_warning(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], changes: dict, expected: list[str]
 ) -> None:
     stages = {
-        **({"pilot": {"stage": "jitter_pilot", "uses": {"pilot": "aux.pilot"}}} if "pilot" in changes else {}),
+        **({"pilot": {"stage": "pilot_jitter", "uses": {"pilot": "aux.pilot"}}} if "pilot" in changes else {}),
         **FOCUS["recommended"]["stages"],
     }
     config = write_tiny(tmp_path, world=None, radar=None, metrics=None, processor={"recommended": {"stages": stages}})

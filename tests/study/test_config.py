@@ -238,17 +238,17 @@ def test_mistakes_are_named(tmp_path: Path, assignments: list[str], expected: li
             ["'aux.true_doppler_hz' is now called 'truth.doppler_hz'"],
         ),
         (
-            ["processor.recommended.stages.r={stage: rotation_entropy, method: descent, order: 2}"],
+            ["processor.recommended.stages.r={stage: entropy_rotation, method: descent, order: 2}"],
             ["'processor.recommended.stages.r.order' is now called 'objective.order'"],
         ),
         (["world.noise.order=2"], ["'world.noise.order' is not known"]),
         (
             ["processor.recommended.stages.r.stage=rotation_genetic"],
-            ["processor.recommended.stages.r: ", "now called 'stage: rotation_entropy, method: genetic'"],
+            ["processor.recommended.stages.r: ", "now called 'stage: entropy_rotation, method: genetic'"],
         ),
         (
             ["processor.recommended.stages.r.stage=rotation_phase_fit"],
-            ["'stage: rotation_phase_fit' is now called 'stage: rotation_coarse, fits: 4'"],
+            ["'stage: rotation_phase_fit' is now called 'stage: coarse_rotation, fits: 4'"],
         ),
     ],
 )

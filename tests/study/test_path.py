@@ -128,7 +128,10 @@ def test_errors_are_added_to_a_recorded_path_and_corrected(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("changes", "match"),
     [
-        ({"transmitter": {"nominal": {"kind": "straigt"}}}, "world.transmitter.nominal.kind.*did you mean 'straight'"),
+        (
+            {"transmitter": {"nominal": {"kind": "straigt"}}},
+            "transmitter.nominal.kind.*did you mean 'straight_path'",
+        ),
         ({"transmitter": {**PATH["world"]["transmitter"], "x": {"a": {"kind": "jiter"}}}}, "did you mean 'jitter'"),
         ({"navigation": {"latency_s": 0.7}}, "world.navigation.latency_s|latency_s of a navigation"),
         ({"beam": {"width_deg": 200.0}}, "between 0 and 180 degrees"),

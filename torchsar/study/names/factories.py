@@ -18,9 +18,24 @@ from torchsar.compensate.pulse_phase import CorrectPulsePhase
 from torchsar.core import Alternate, Turn
 from torchsar.focus import OmegaK, PaddedLines, TargetImage
 from torchsar.io.plain import measured_displacement, read_array
-from torchsar.radar import LIGHT_M_S, FarField, InverseRadar, Spotlight, StripmapRadar, read_track
-from torchsar.repair import BandLimited, CorrectJitter, Lagrange
-from torchsar.scene import Dechirped, ImageReflectivity, KSea, MeasuredTrack, Polynomial, RecordedPath
+from torchsar.multichannel import (
+    AlongTrackAutofocus,
+    Detector,
+    ElementPattern,
+    Extraction,
+    FlatBand,
+    LeastSquares,
+    MigratingLines,
+    MinimumMeanSquare,
+    MovingPointVelocity,
+    Search,
+    SignalIntensityRatio,
+)
+from torchsar.multichannel.reconstruct import Rebuild
+from torchsar.multichannel.scene_image import MoversImage
+from torchsar.multichannel.velocity.aperture import ELEMENT_BEAM, Expected
+from torchsar.radar import LIGHT_M_S, BistaticRadar, FarField, InverseRadar, Spotlight, StripmapRadar, read_track
+from torchsar.scene import Dechirped, ImageReflectivity, KSea, MeasuredTrack, Polynomial, RecordedPath, Sinusoid
 
 
 def effective_velocity(
@@ -43,7 +58,7 @@ def effective_velocity(
     return EffectiveVelocity(OmegaK(radar, reference), reach_m_s, lines, tolerance_m_s=tolerance_m_s, assess=assess)
 
 
-def omega_k_padded(
+def padded_lines(
     radar: StripmapRadar,
     reference: Literal["matched", "flat", "phase"] | None = "matched",
     velocity_m_s: float | None = None,
@@ -119,26 +134,122 @@ def rotation_and_phase(
     )
 
 
-def jitter_lagrange(points: int = 4, offset_samples: Tensor | None = None) -> CorrectJitter:
-    """Correction of periodic sampling jitter by Lagrange interpolation.
+def vibration(name: str, unit: Literal["mm", "um"]) -> Sinusoid:
+    """Sinusoidal vibration by a name of the form amplitude_frequency_phase, such as `1_0.1_90`.
 
     Args:
-        points: Number of points of the interpolation.
-        offset_samples: Offsets of one period in samples, if they are known.
+        name: Amplitude in `unit`, frequency in hertz and phase in degrees.
+        unit: Unit of the amplitude, "mm" or "um".
     """
-    return CorrectJitter(offset_samples, Lagrange(points))
+    return Sinusoid.named(name, unit=unit)
 
 
-def jitter_band_limited(points: int = 8, band: float = 0.95, offset_samples: Tensor | None = None) -> CorrectJitter:
-    """Correction of periodic sampling jitter by interpolation with the weights of least error for a
-    band-limited signal.
+def moving_point_velocity(
+    radar: BistaticRadar,
+    aperture: Expected = ELEMENT_BEAM,
+    search: Search | None = None,
+    u_a_m_s: float | None = None,
+    range_m: float | None = None,
+    assess: bool = True,
+) -> MigratingLines:
+    """Recommended estimator of velocity and position of a moving target. It needs no initial
+    values, only the limits of the search.
 
     Args:
-        points: Number of points of the interpolation.
-        band: Ratio of the bandwidth of the signal to the sampling rate.
-        offset_samples: Offsets of one period in samples, if they are known.
+        aperture: Illumination of the target.
+        search: Extent of the search; None for 1.5 times the ambiguous velocity of the radar in
+            slant-range speed.
+        u_a_m_s: Along-track speed in m/s if it is known a priori; None to estimate it.
+        range_m: Closest range of the target in m; None for that of the strongest range line, or for
+            the reference range of the radar if the data have no range axis.
+        assess: Whether the outcome is assessed.
     """
-    return CorrectJitter(offset_samples, BandLimited(points, band))
+    estimator = MovingPointVelocity(radar, aperture, range_m, search, u_a_m_s, assess=assess)
+    return MigratingLines(radar, estimator, assess=assess)
+
+
+def alternate_velocity(
+    radar: BistaticRadar,
+    bandwidth_hz: float,
+    aperture: Expected = ELEMENT_BEAM,
+    rebuild: Rebuild | None = None,
+    rounds: int = 2,
+    step_m_s: float = 0.5,
+    half_m_s: float = 20.0,
+    assess: bool = True,
+) -> MigratingLines:
+    """Alternate estimation of the slant-range speed u_r of a target by the signal intensity ratio,
+    and of its along-track speed u_a by autofocus.
+
+    Args:
+        bandwidth_hz: Width of the processed Doppler band in Hz.
+        aperture: Illumination of the target.
+        rebuild: Reconstruction of the Doppler bands; None for least squares with three bands.
+        rounds: Number of rounds; each round estimates u_r and then u_a.
+        step_m_s: Step of the search for u_r in m/s.
+        half_m_s: Half width of the search interval of u_a about 0, in m/s.
+        assess: Whether the outcome is assessed.
+
+    Reference:
+        Remote Sens. 2020, 12, 1703, section 4.3.
+    """
+    ratio = SignalIntensityRatio(radar, bandwidth_hz, rebuild, None, step_m_s, assess=assess)
+    autofocus = AlongTrackAutofocus(radar, aperture, None, half_m_s, assess=assess)
+    made = Alternate(rounds, u_r=Turn(ratio), u_a=Turn(autofocus))
+    made.works_on, made.also_on = autofocus.works_on, autofocus.also_on
+    return MigratingLines(radar, made, one_line=True, assess=assess)
+
+
+def movers_image(
+    radar: BistaticRadar,
+    bands: int = 2,
+    method: Literal["least_squares", "mmse"] = "least_squares",
+    band_hz: float | None = None,
+    snr_db: float = 40.0,
+    removal: Literal["subtract", "zero"] = "subtract",
+    integration_s: float = 4.5,
+    segment_s: float = 0.6,
+    half_along_m: float = 120.0,
+    half_range_m: float = 60.0,
+    threshold_db: float = 10.0,
+    most: int = 8,
+    u_a_reach_m_s: float = 20.0,
+    suppressed_m_s: Sequence[float] = Detector().suppressed_m_s,
+    assess: bool = True,
+) -> MoversImage:
+    """Image of a scene with its moving targets focused at their true positions, and estimates of
+    their motion.
+
+    Args:
+        bands: Number of Doppler bands, each as wide as the PRF, that are separated.
+        method: Reconstruction of the bands: "least_squares", or "mmse" (minimum mean-square error),
+            which also works where the least-squares solution is singular.
+        band_hz: Width in Hz of the flat Doppler spectrum that "mmse" assumes; None for the spectrum
+            that the antenna pattern of the channels gives.
+        snr_db: Signal-to-noise ratio that "mmse" assumes, in dB.
+        removal: "subtract" removes the echo fitted to a target; "zero" removes all data in the area
+            of the target, including the sea.
+        integration_s: Time in s for which a scatterer is illuminated.
+        segment_s: Length in s of the segments of slow time in which the sea about a target is
+            suppressed.
+        half_along_m: Half width of a target along track in m.
+        half_range_m: Half width of a target in range in m.
+        threshold_db: Least contrast of a target in dB: the mean intensity of a small rectangle of
+            pixels over the median of all such means.
+        most: Largest number of targets.
+        u_a_reach_m_s: Half width of the search in the along-track speed in m/s.
+        suppressed_m_s: Slant-range speeds in m/s for a further image in which the sea is
+            suppressed, so that weaker targets are detected; empty to omit this image.
+        assess: Whether the outcome is assessed.
+
+    Reference:
+        Remote Sens. 2020, 12, 1703, Fig. 13.
+    """
+    extraction = Extraction(half_along_m, half_range_m, integration_s, segment_s)
+    detector = Detector(threshold_db, most=most, suppressed_m_s=suppressed_m_s)
+    prior = ElementPattern() if band_hz is None else FlatBand(band_hz)
+    rebuild = LeastSquares(bands) if method == "least_squares" else MinimumMeanSquare(bands, snr_db, prior)
+    return MoversImage(radar, rebuild, removal, extraction, detector, u_a_reach_m_s, assess=assess)
 
 
 def drift(velocity_m_s: Tensor | float = 0.0, acceleration_m_s2: Tensor | float = 0.0) -> Polynomial:

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from torchsar.study.settings.errors import did_you_mean
 
-# keys, values and stages that were renamed; the message about an old one gives the new one
+# keys, values, stages and kinds that were renamed; the message about an old one gives the new one
 RENAMED = {
     "damages": "impairments",
     "told": "trigger_known",
@@ -20,12 +20,56 @@ RENAMED = {
     **{
         key: f"objective.{key}" for key in ("order", "range_term", "yc_m", "variables", "oversampling", "lines", "taps")
     },
-    "rotation_phase_fit": "rotation_coarse, fits: 4",
-    "rotation_search": "rotation_entropy, method: grid",
+    "rotation_phase_fit": "coarse_rotation, fits: 4",
+    "rotation_search": "entropy_rotation, method: grid",
     **{
-        f"rotation_{name}": f"rotation_entropy, method: {name}"
+        f"rotation_{name}": f"entropy_rotation, method: {name}"
         for name in ("genetic", "evolution", "newton", "descent")
     },
+    **{
+        f"{what}_{verb}": f"{verb}_{what}"
+        for verb, whats in {
+            "correct": ("imbalance", "response", "path", "pulse_phase", "migration"),
+            "remove": ("synchronisation", "transmit_range"),
+        }.items()
+        for what in whats
+    },
+    **{f"interference_{verb}": f"{verb}_interference" for verb in ("subtract", "notch", "drop")},
+    **{what: f"estimate_{what}" for what in ("imbalance", "response", "synchronisation")},
+    "response_flat_band": "estimate_flat_response",
+    "jitter_pilot": "pilot_jitter",
+    "jitter_blind": "blind_jitter",
+    "jitter_exact": "correct_jitter",
+    "jitter_lagrange": "correct_jitter, method: {kind: lagrange, points: 4}",
+    "jitter_band_limited": "correct_jitter, method: {kind: band_limited}",
+    "channel_balance": "estimate_balance",
+    "channel_balance_correct": "correct_balance",
+    "rotation": "uneven_rotation",
+    "rotation_coarse": "coarse_rotation",
+    "rotation_entropy": "entropy_rotation",
+    "rebuild_bands": "reconstruct",
+    "intensity_ratio": "signal_intensity_ratio",
+    "omega_k_padded": "padded_lines",
+    "focus_target": "focus_azimuth",
+    "dwell_s": "aperture.duration_s",
+    "bands": "rebuild.bands",
+    "u_r_reach_m_s": "search.u_r_m_s",
+    "u_a_reach_m_s": "search.u_a_m_s",
+    "y0_reach_m": "search.y0_m",
+    "straight": "straight_path",
+    "circular": "circular_path",
+    "plane": "plane_ground",
+    "normal": "start_phase",
+    "uniform": "uniform_start_phase",
+    "scintillation": "log_amplitude",
+    "polynomial": "polynomial_sweep_error",
+    "sinusoid": "sinusoid_sweep_error",
+    "fibre": "calibration_fibre",
+    "image": "image_sea",
+    "exact": "exact_range",
+    "taylor": "taylor_range",
+    "clock_errors": "synchronisation_error",
+    "channel_response": "smooth_response",
 }
 
 

@@ -80,6 +80,14 @@ class Section:
                 )
         return found
 
+    @property
+    def is_complete(self) -> bool:
+        """Whether YAML can represent all required parameters."""
+        try:
+            return self.keys is not None
+        except TypeError:
+            return False
+
     @cached_property
     def model(self) -> type[BaseModel]:
         fields: dict[str, Any] = {name: (key.type, key.default) for name, key in self.keys.items()}
@@ -171,7 +179,8 @@ class Catalogue:
     Args:
         what: Kind of the entries, for messages.
         key: The key of a config that holds the name.
-        entries: Classes or factories by name.
+        entries: Classes or factories, whose names in snake case are those of the entries, or a
+            mapping of other names to them.
         given: Parameters that are not keys of the config.
         automatic: Keys that may have the value `auto`, as `ENTRY.key`.
     """
@@ -180,11 +189,13 @@ class Catalogue:
         self,
         what: str,
         key: str,
-        entries: Mapping[str, Callable[..., Any]],
+        entries: Sequence[Callable[..., Any]] | Mapping[str, Callable[..., Any]],
         given: Sequence[str] = (),
         automatic: Sequence[str] = (),
     ) -> None:
-        self.what, self.key, self.entries = what, key, dict(entries)
+        self.what, self.key = what, key
+        named = {snake(one.__name__): one for one in entries} if isinstance(entries, Sequence) else entries
+        self.entries: dict[str, Callable[..., Any]] = dict(named)
         self.automatic = automatic
         free = [key.split(".") for key in automatic]
         self.sections = {
@@ -259,7 +270,7 @@ def _key(hint: Any, default: Any) -> Key | None:
         return Key(plain, value, per_trial={float, Tensor} <= scalars, as_tensor=as_tensor)
     classes: list[Any] = [arm for arm in arms if dataclasses.is_dataclass(arm)]
     if len(classes) > 1:
-        inner, many = Catalogue("choice", "kind", {_snake(c.__name__): c for c in classes}), ""
+        inner, many = Catalogue("choice", "kind", classes), ""
     else:
         inner, many = next((found for found in map(_inner, arms) if found[0] is not None), (None, ""))
     if inner is None:
@@ -342,5 +353,6 @@ def _is_index(text: str | None, value: Any) -> bool:
     return text is None or (text.isdecimal() and int(text) < len(value))
 
 
-def _snake(name: str) -> str:
-    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
+def snake(name: str) -> str:
+    """Return the name of a class in snake case: `OmegaKStolt` gives `omega_k_stolt`."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", name).lower()

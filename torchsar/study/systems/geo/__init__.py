@@ -76,9 +76,9 @@ class Geo(System):
     peak = 12.0
     tolerance = {"image_error_db": -20.0, "echo_error_db": -20.0, "mfta_db": -50.0, "width_change_percent": 1.0}
     exact = {
-        "world.receive": {"kind": "exact"},
-        "transmit_range_remove.order": {"order": None},
-        "migration_correct.kind": {"kind": "keystone"},
+        "world.receive": {"kind": "exact_range"},
+        "remove_transmit_range.order": {"order": None},
+        "correct_migration.migration": {"migration": {"kind": "keystone", "whole_swath": True}},
     }
     definitions = {
         "snr": "power of the target over noise variance in one range-compressed sample of one channel, dB "

@@ -145,7 +145,7 @@ class IsalRotation(System):
     tolerance = {"echo_error_db": -20.0, "image_error_db": -20.0, "peak_loss_db": 0.25, "k1_error_percent": 0.1}
     exact = {
         "world.fidelity": {"kind": "dechirped", "track_m": None},
-        "rotation.order": {"order": 4},
+        "uneven_rotation.order": {"order": 4},
         "matched_fourier.transform": {"transform": {"kind": "explicit_sum"}},
     }
     definitions = {
