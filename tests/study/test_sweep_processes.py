@@ -50,7 +50,7 @@ def start(out: Path, slow_s: float = 0.0, log: Path | None = None, workers: int 
 
 def command_line(*words: str) -> int:
     """The command line with a progress line every 0.2 s."""
-    progress._PIPED_S = 0.2
+    progress._EVERY_S = 0.2
     return main(words)
 
 
