@@ -134,6 +134,7 @@ WORLD = {
 
 # the bases of other stages, and what gives no signal
 _NO_STAGES = ("path_image", "image_movers")
+# stages that a function builds from plain keys, by the package where they are listed
 _BUILT = {
     "repair": (),
     "compensate": (factories.autofocus, factories.effective_velocity, factories.rotation_and_phase),
@@ -159,7 +160,8 @@ def _public(package: Any) -> dict[str, Callable[..., Any]]:
 
 
 GROUPS: dict[str, dict[str, Callable[..., Any]]] = {
-    package.__name__.rpartition(".")[2]: _public(package) for package in (repair, compensate, multichannel, focus)
+    package.__name__.removeprefix("torchsar."): _public(package)
+    for package in (repair, compensate, multichannel, focus)
 }
 for _group, _made in _BUILT.items():
     GROUPS[_group] |= {one.__name__: one for one in _made}
