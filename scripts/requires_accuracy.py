@@ -26,7 +26,7 @@ import torch
 
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.table import load
-from torchsar.study.trials.auto import choices_of, tolerance_of
+from torchsar.study.trials.choice import choices_of, tolerance_of
 from torchsar.study.trials.bench import Bench
 
 # of the Sobol sequence; the predictions were developed on scenes of seed 1

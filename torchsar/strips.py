@@ -21,7 +21,7 @@ from torchsar.study.output.folder import ResultFolder, fresh_result, opened
 from torchsar.study.output.progress import progress
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.settings.sections import Loaded
-from torchsar.study.trials.chains import build_chains
+from torchsar.study.trials.bench import build_chains
 
 log = logging.getLogger("torchsar")
 # image lines of a chunk of the store at most

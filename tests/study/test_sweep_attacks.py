@@ -20,8 +20,8 @@ from torchsar.cli import main
 from torchsar.study.montecarlo import Stop, read_sweep, sweep
 from torchsar.study.montecarlo.engines import engine
 from torchsar.study.montecarlo.grid import address, check_name, make_grid
+from torchsar.study.montecarlo.record import summary_of
 from torchsar.study.montecarlo.store import Store
-from torchsar.study.montecarlo.summary import summary_of
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.table import load
 

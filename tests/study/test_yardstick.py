@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 
 from tests.study.scenes import bench_of, world
-from torchsar.study.trials.auto import choices_of
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.choice import Choice
+from torchsar.study.trials.choice import Choice, choices_of
 
 # largest errors in dB: what these small scenes neglect, with a few dB to spare
 BARS = {"stripmap": -15.0, "isal": -15.0, "isal_rotation": -25.0, "sal": -60.0, "geo": -30.0}

@@ -76,10 +76,9 @@ from torchsar.core.phase import (
     unit_phasor,
     wrapped,
 )
-from torchsar.core.polynomials import legendre
 from torchsar.core.select import best_of, numbers_on, per_trial, take, true_positions
 from torchsar.core.signal import Recording, Signal, Truth
-from torchsar.core.spline import Spline
+from torchsar.core.spline import Spline, legendre
 from torchsar.core.stage import Stage
 from torchsar.core.stored import ArrayFile, StoredArray
 

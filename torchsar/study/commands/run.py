@@ -14,11 +14,10 @@ from torch import Tensor
 from torchsar.core import Outcome, counts
 from torchsar.io.arrays import write_arrays
 from torchsar.study.commands.requires import refuse_beyond_limits
-from torchsar.study.output.arrays import write_json
 from torchsar.study.output.folder import fresh_result
-from torchsar.study.output.pictures import draw_all
+from torchsar.study.output.numbers import write_json
 from torchsar.study.output.progress import progress
-from torchsar.study.output.report import run_fields, write_page
+from torchsar.study.output.report import draw_all, run_fields, write_page
 from torchsar.study.settings.cases import ALL, cases_of, key_of
 from torchsar.study.settings.sections import Loaded
 from torchsar.study.trials.batch import Batch, Found, Result, joined_found, joined_metrics, summary

@@ -20,17 +20,15 @@ import torch
 from torchsar import plot
 from torchsar.study.commands.requires import aligned
 from torchsar.study.memory import PeakMemory, wait_for_devices
-from torchsar.study.output.arrays import write_json
 from torchsar.study.output.folder import fresh_result
-from torchsar.study.output.numbers import MISSING, number
+from torchsar.study.output.numbers import MISSING, number, write_json
 from torchsar.study.output.progress import progress
 from torchsar.study.output.report import installed_version
 from torchsar.study.settings.cases import cases_of
 from torchsar.study.settings.errors import ConfigError, one_line
 from torchsar.study.settings.sections import Loaded
-from torchsar.study.trials.auto import choices_of, tolerance_of, within
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.choice import EXACT_DB, Alternative, Choice, Measured
+from torchsar.study.trials.choice import EXACT_DB, Alternative, Choice, Measured, choices_of, tolerance_of, within
 
 log = logging.getLogger("torchsar")
 FILES = ("config.yaml", "trade.json", "trade.txt", "figures")

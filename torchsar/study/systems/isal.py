@@ -27,9 +27,8 @@ from torchsar.radar import InverseRadar, geometry_of
 from torchsar.scene import Dechirped, Motion, PhaseOnly, Points, Scene, Sinusoid, Together, TurntableWorld
 from torchsar.scene.turntable import Fidelity
 from torchsar.scene.vibration import PulsePhase, displacement_m
-from torchsar.study.names.factories import with_wavelength
-from torchsar.study.names.registry import FIDELITIES, MOTIONS, SCENES, START_PHASES, TARGET_IMPAIRMENTS
-from torchsar.study.output.pictures import Drawn, first_named
+from torchsar.study.names.registry import FIDELITIES, MOTIONS, SCENES, START_PHASES, TARGET_IMPAIRMENTS, with_wavelength
+from torchsar.study.output.report import Drawn, first_named
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.trials.batch import IMAGE, Batch, Judged, Result, Trials
 from torchsar.study.trials.bench import Bench

@@ -17,7 +17,7 @@ from torchsar.metrics import bistatic_bounds
 from torchsar.multichannel.reconstruct import noise_and_clutter
 from torchsar.radar import BistaticRadar
 from torchsar.study.names.registry import MULTICHANNEL_IMPAIRMENTS
-from torchsar.study.output.pictures import Drawn, comparisons
+from torchsar.study.output.report import Drawn, comparisons
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.settings.sections import Loaded
 from torchsar.study.systems.geo import choices, figures

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchsar import plot
 from torchsar.core import Signal
-from torchsar.study.output.pictures import Drawn
+from torchsar.study.output.report import Drawn
 from torchsar.study.settings.cases import key_of
 from torchsar.study.systems.geo.judge import PeakCuts
 from torchsar.study.trials.batch import Result

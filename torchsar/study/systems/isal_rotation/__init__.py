@@ -18,8 +18,7 @@ from torchsar.focus.requirements import Limit
 from torchsar.metrics import contrast, entropy, rotation_bounds
 from torchsar.radar import InverseRadar
 from torchsar.scene import Points, PolynomialRotation, Scatterers, Scene, Together, TurntableWorld
-from torchsar.study.names.factories import with_wavelength
-from torchsar.study.names.registry import TARGET_IMPAIRMENTS
+from torchsar.study.names.registry import TARGET_IMPAIRMENTS, with_wavelength
 from torchsar.study.systems.isal import Target
 from torchsar.study.systems.isal import target as draw_target
 from torchsar.study.systems.isal_rotation import choices, figures

@@ -37,7 +37,6 @@ from torchsar.scene import (
 )
 from torchsar.scene.ladar import SweepError
 from torchsar.scene.ladar_range import Fidelity
-from torchsar.study.names.factories import with_wavelength
 from torchsar.study.names.registry import (
     CALIBRATIONS,
     LADAR_IMPAIRMENTS,
@@ -47,6 +46,7 @@ from torchsar.study.names.registry import (
     SWEEP_ERRORS,
     SWEEP_FIDELITIES,
     group_of,
+    with_wavelength,
 )
 from torchsar.study.settings.errors import ConfigError, did_you_mean
 from torchsar.study.systems.sal import choices, figures

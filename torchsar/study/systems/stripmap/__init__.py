@@ -23,9 +23,8 @@ from torchsar.metrics.bounds import reference_doppler_std_hz, tone_frequency_bou
 from torchsar.radar import StripmapRadar
 from torchsar.scene import AlwaysLit, Hyperbola, Points, RandomPoints, Scene, StripmapWorld, Together
 from torchsar.scene.strip import Beam, Path
-from torchsar.study.names.factories import with_wavelength
-from torchsar.study.names.registry import BEAMS, IMPAIRMENTS, PATHS, SCENES
-from torchsar.study.output.pictures import Drawn, comparisons
+from torchsar.study.names.registry import BEAMS, IMPAIRMENTS, PATHS, SCENES, with_wavelength
+from torchsar.study.output.report import Drawn, comparisons
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.settings.sections import Loaded
 from torchsar.study.systems.stripmap import figures
