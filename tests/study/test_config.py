@@ -9,8 +9,8 @@ import pytest
 from tests.study.tiny import TINY, write_tiny
 from torchsar.core import Draws
 from torchsar.study.commands.sweep import SweepTrial, sweep_grid
-from torchsar.study.settings.cases import cases_of
 from torchsar.study.settings.errors import ConfigError
+from torchsar.study.settings.sections import cases_of
 from torchsar.study.settings.text import dump, override, packaged_configs, parse
 from torchsar.study.table import load
 from torchsar.study.trials.bench import Bench

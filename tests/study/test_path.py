@@ -15,8 +15,8 @@ from torchsar.radar import LIGHT_M_S
 from torchsar.study.commands.requires import refuse_beyond_limits
 from torchsar.study.commands.sweep import SweepTrial
 from torchsar.study.montecarlo import sweep
-from torchsar.study.settings.cases import cases_of
 from torchsar.study.settings.errors import ConfigError
+from torchsar.study.settings.sections import cases_of
 from torchsar.study.table import load
 from torchsar.study.trials.bench import Bench
 

@@ -18,8 +18,7 @@ from torchsar.study.output.folder import fresh_result
 from torchsar.study.output.numbers import write_json
 from torchsar.study.output.progress import progress
 from torchsar.study.output.report import draw_all, run_fields, write_page
-from torchsar.study.settings.cases import ALL, cases_of, key_of
-from torchsar.study.settings.sections import Loaded
+from torchsar.study.settings.sections import ALL, Loaded, cases_of, key_of
 from torchsar.study.trials.batch import Batch, Found, Result, joined_found, joined_metrics, summary
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.system import per_trial_first

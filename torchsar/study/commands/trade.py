@@ -24,9 +24,8 @@ from torchsar.study.output.folder import fresh_result
 from torchsar.study.output.numbers import MISSING, number, write_json
 from torchsar.study.output.progress import progress
 from torchsar.study.output.report import installed_version
-from torchsar.study.settings.cases import cases_of
 from torchsar.study.settings.errors import ConfigError, one_line
-from torchsar.study.settings.sections import Loaded
+from torchsar.study.settings.sections import Loaded, cases_of
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import EXACT_DB, Alternative, Choice, Measured, choices_of, tolerance_of, within
 

@@ -32,8 +32,14 @@ from torchsar.study.output.report import Drawn, first_named
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.trials.batch import IMAGE, Batch, Judged, Result, Trials
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.choice import Alternative, Choice, Measured, beside_direct_sum
-from torchsar.study.trials.direct_images import DirectlySummed, turning_target
+from torchsar.study.trials.choice import (
+    Alternative,
+    Choice,
+    DirectlySummed,
+    Measured,
+    beside_direct_sum,
+    turning_target,
+)
 from torchsar.study.trials.system import Column, Noise, System, World
 
 

@@ -39,8 +39,7 @@ from torchsar.study.output.report import Drawn, first_named
 from torchsar.study.systems.isal import estimated_phase, received
 from torchsar.study.trials.batch import IMAGE, Batch, Judged, Metrics, Processed, Result, Trials
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.choice import Alternative, Choice, Measured
-from torchsar.study.trials.direct_images import some_pixels, white_noise
+from torchsar.study.trials.choice import Alternative, Choice, Measured, some_pixels, white_noise
 from torchsar.study.trials.system import Column, Noise, System, World, by_limit
 
 

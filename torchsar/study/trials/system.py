@@ -15,8 +15,7 @@ from torchsar.core import Draws, Recording, Signal, Trace
 from torchsar.focus.requirements import Limit, Requirement
 from torchsar.study.names.registry import stages
 from torchsar.study.output.report import Drawn, comparisons
-from torchsar.study.settings.cases import ALL, titled, word_of
-from torchsar.study.settings.sections import MAGNITUDES, Loaded, Magnitudes
+from torchsar.study.settings.sections import ALL, MAGNITUDES, Loaded, Magnitudes, titled, word_of
 from torchsar.study.settings.signature import Catalogue, Section
 from torchsar.study.trials.batch import IMAGE, Batch, Found, Judged, Processed, Result, Trials
 from torchsar.study.trials.bench import Bench

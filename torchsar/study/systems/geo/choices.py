@@ -47,8 +47,14 @@ from torchsar.study.systems.geo.judge import FocusedPoint, PeakCuts, point_respo
 from torchsar.study.systems.geo.world import TRUTHS, Level, Points
 from torchsar.study.trials.batch import Trials
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.choice import Alternative, Choice, Measured, beside_direct_sum
-from torchsar.study.trials.direct_images import DirectlySummed, points_at_rest
+from torchsar.study.trials.choice import (
+    Alternative,
+    Choice,
+    DirectlySummed,
+    Measured,
+    beside_direct_sum,
+    points_at_rest,
+)
 from torchsar.study.trials.system import by_limit
 
 _ESTIMATORS: dict[type, Estimator] = {

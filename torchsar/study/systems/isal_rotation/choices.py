@@ -27,8 +27,14 @@ from torchsar.scene import PhaseOnly, Points
 from torchsar.study.systems.isal import echo_choices
 from torchsar.study.trials.batch import Trials
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.choice import Alternative, Choice, Measured, beside_direct_sum
-from torchsar.study.trials.direct_images import DirectlySummed, turning_target
+from torchsar.study.trials.choice import (
+    Alternative,
+    Choice,
+    DirectlySummed,
+    Measured,
+    beside_direct_sum,
+    turning_target,
+)
 from torchsar.study.trials.system import Noise
 
 # orders of the rotation that are compared, and more where the target has more
