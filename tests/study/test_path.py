@@ -160,7 +160,7 @@ def test_a_pulse_rate_below_the_band_of_the_beam_is_named(tmp_path: Path) -> Non
 def test_a_motion_log_is_flown(tmp_path: Path) -> None:
     rows = (f"{t / 50:.2f},-1500,{100 * t / 50 - 48},1500" for t in range(80))
     (tmp_path / "log.csv").write_text("\n".join(["time_s,x,y,z", *rows]))
-    nominal = {"kind": "recorded", "file": str(tmp_path / "log.csv")}
+    nominal = {"kind": "recorded_path", "file": str(tmp_path / "log.csv")}
     own = {**PATH["world"]["transmitter"], "nominal": nominal}
     found = metrics_of(bench_of(tmp_path, "path", world=world("path", transmitter=own)))
     straight = metrics_of(bench_of(tmp_path, "path"))
