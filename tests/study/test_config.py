@@ -198,7 +198,7 @@ def test_unknown_config_names_what_there_is() -> None:
         (["=3"], ["is not an override"]),
         ([".seed=3"], ["'.seed=3' is not an override"]),
         (["world=3"], ["'world' has the value 3", "mapping of keys"]),
-        (["world.scene={}"], ["world", "world needs at least one scene"]),
+        (["world.scene={}"], ["world", "world needs at least 1 scene"]),
         (["data.file=/tmp"], ["data.file", "'/tmp' is no file"]),
         (["world.lines=1000000000000"], ["world", "raw data of a trial take 1.02e+06 GB"]),
         (["world.scene.points.azimuth_m=[1.0, 2.0, 3.0]"], ["world.scene.points", "as many ranges", "[3, 2]"]),

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import jinja2
 import numpy as np
@@ -25,14 +25,22 @@ from torchsar.plot import name_and_unit
 from torchsar.study.output.numbers import MISSING, number, quantity, scale_of
 
 
-class Column(Protocol):
-    """Presentation of a metric."""
+@dataclass(frozen=True)
+class Column:
+    """Presentation of a metric in reports and pictures.
 
-    @property
-    def label(self) -> str: ...
+    Args:
+        label: Its name in words.
+        unit: Its unit for tables and axes; SI units are shown with prefixes.
+        digits: Number of digits after the decimal point.
+        drawn: Statistic over trials in the picture that compares methods: "mean", "rms", or "" for
+            no picture.
+    """
 
-    @property
-    def unit(self) -> str: ...
+    label: str
+    unit: str = ""
+    digits: int = 3
+    drawn: str = ""
 
 
 Shown = Mapping[str, Column]
