@@ -250,6 +250,14 @@ def test_mistakes_are_named(tmp_path: Path, assignments: list[str], expected: li
             ["processor.recommended.stages.r.stage=rotation_phase_fit"],
             ["'stage: rotation_phase_fit' is now called 'stage: coarse_rotation, fits: 4'"],
         ),
+        (
+            ["processor.recommended.stages.r.stage=pulse_phase_correct"],
+            ["'stage: pulse_phase_correct' is now called 'stage: correct_pulse_phase'"],
+        ),
+        (
+            ["processor.recommended.stages.r={stage: interferometry, dwell_s: 4.5}"],
+            ["stages.r.dwell_s' is now called 'aperture.duration_s'"],
+        ),
     ],
 )
 def test_old_names_are_given_the_new_ones(tmp_path: Path, assignments: list[str], expected: list[str]) -> None:
