@@ -45,7 +45,7 @@ from torch import Tensor
 from torchsar import keep_freed_memory
 from torchsar.core import Draws, Trace
 from torchsar.core.draws import Source
-from torchsar.study.settings.cases import cases_of
+from torchsar.study.settings.sections import cases_of
 from torchsar.study.settings.text import find_config
 from torchsar.study.table import load
 from torchsar.study.trials.bench import Bench

@@ -28,7 +28,7 @@ from torch import Tensor, nn
 
 from torchsar import keep_freed_memory
 from torchsar.core import Chain, Draws, Recording
-from torchsar.study.settings.cases import cases_of
+from torchsar.study.settings.sections import cases_of
 from torchsar.study.table import load
 from torchsar.study.trials.bench import Bench
 

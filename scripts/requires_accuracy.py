@@ -26,8 +26,8 @@ import torch
 
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.table import load
-from torchsar.study.trials.auto import choices_of, tolerance_of
 from torchsar.study.trials.bench import Bench
+from torchsar.study.trials.choice import choices_of, tolerance_of
 
 # of the Sobol sequence; the predictions were developed on scenes of seed 1
 SEED = 2

@@ -20,7 +20,7 @@ from tests.helpers import enable_interrupts
 from tests.study.tiny import write_tiny
 from torchsar.cli import main
 from torchsar.study.commands import run
-from torchsar.study.output.progress import Count, Steps
+from torchsar.study.output.progress import progress
 
 
 @pytest.fixture
@@ -128,28 +128,13 @@ def test_help_and_usage_errors_answer_at_once(arguments: list[str], status: int,
     assert spent < 0.5
 
 
-def test_a_remaining_time_is_named_while_a_step_takes_no_longer_than_those_before(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    now = 0.0
-    monkeypatch.setattr("torchsar.study.output.progress.time.perf_counter", lambda: now)
-    steps = Steps(["echo", "autofocus", "image"])
-    steps.begin("echo")
-    assert "left" not in steps.say()
-    now = 10.0
-    steps.begin("autofocus")
-    now = 14.0
-    assert steps.say() == "step 2 of 3: autofocus for 0:04, 0:14 in all, about 0:16 left"
-    now = 60.0
-    assert steps.say() == "step 2 of 3: autofocus for 0:50, 1:00 in all"
-    steps.begin("image")
-    assert steps.say().endswith("about 0:30 left")
-    count = Count("trials", 40)
-    now = 70.0
-    count.advance(10)
-    assert count.say() == "10 of 40 trials after 0:10, 1 trials/s, about 0:30 left"
-    now = 130.0
-    assert count.say() == "10 of 40 trials after 1:10, 1 trials/s"
+def test_progress_has_a_rate_and_a_remaining_time_once_work_is_long(capsys: pytest.CaptureFixture[str]) -> None:
+    with progress(40, "trials", done=4) as count:
+        count.update(6)
+        assert capsys.readouterr().err == ""
+        count.start_t = count.last_print_t = count.start_t - 12.0  # as after 12 seconds
+        count.update(6)
+    assert re.search(r"16/40 \[00:12<00:2\d, +[.\d]+ ?(trials/s|s/ trials)", capsys.readouterr().err)
 
 
 @pytest.mark.parametrize("command", ["run", "sweep", "requires", "trade", "import", "list"])
@@ -341,7 +326,7 @@ def test_doubtful_recordings_are_named_in_a_warning(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], changes: dict, expected: list[str]
 ) -> None:
     stages = {
-        **({"pilot": {"stage": "jitter_pilot", "uses": {"pilot": "aux.pilot"}}} if "pilot" in changes else {}),
+        **({"pilot": {"stage": "pilot_jitter", "uses": {"pilot": "aux.pilot"}}} if "pilot" in changes else {}),
         **FOCUS["recommended"]["stages"],
     }
     config = write_tiny(tmp_path, world=None, radar=None, metrics=None, processor={"recommended": {"stages": stages}})

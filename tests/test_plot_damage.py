@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from torchsar.core import Axis, Signal
-from torchsar.study.output.pictures import draw_all
+from torchsar.study.output.report import draw_all
 
 plot = pytest.importorskip("torchsar.plot")
 CHANGES: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {

@@ -172,7 +172,10 @@ def test_a_bad_recording_gives_one_sentence(
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"more": "equal: {stage: response_flat_band}"}, "the stages ['equal'] follow focus; a chain for long strips"),
+        (
+            {"more": "equal: {stage: estimate_flat_response}"},
+            "the stages ['equal'] follow focus; a chain for long strips",
+        ),
         ({"before": "shift: {stage: range_compress}"}, "the stage 'shift' before focus changes the samples"),
         ({"key": ", band_hz: 1500.0"}, "memory_bytes must hold blocks of at least"),
         ({"memory_lines": 60}, "memory_bytes must hold blocks of at least"),

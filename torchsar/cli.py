@@ -41,7 +41,6 @@ _PRINTED = {
     "config": "print a packaged config, to begin one's own with, or the JSON schema of configs for editors",
     "completion": "print a script by which a shell completes the commands",
 }
-_SHELLS = ("bash", "zsh", "fish")
 
 
 def parser() -> argparse.ArgumentParser:
@@ -61,7 +60,8 @@ def parser() -> argparse.ArgumentParser:
     commands = top.add_subparsers(dest="command", metavar="COMMAND")
     for name, text in _COMMANDS.items():
         one = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
-        one.add_argument("config", help="a YAML file, or the name of a packaged config (see `torchsar list`)")
+        chosen = one.add_argument("config", help="a YAML file, or the name of a packaged config (see `torchsar list`)")
+        chosen.completer = _configs  # pyright: ignore[reportAttributeAccessIssue]
         one.add_argument(
             "overrides", nargs="*", default=[], metavar="key=value", help="overrides, such as world.noise.snr_db=10"
         )
@@ -104,9 +104,17 @@ def parser() -> argparse.ArgumentParser:
     commands.choices["list"].add_argument("words", nargs="*", metavar="WORD", help=words)
     one = commands.choices["config"]
     one.add_argument("what", choices=("show", "schema"), help="a packaged config, or the schema of all configs")
-    one.add_argument("config", nargs="?", help="name of the packaged config (see `torchsar list`)")
-    commands.choices["completion"].add_argument("shell", choices=_SHELLS, help="the shell")
+    chosen = one.add_argument("config", nargs="?", help="name of the packaged config (see `torchsar list`)")
+    chosen.completer = _configs  # pyright: ignore[reportAttributeAccessIssue]
+    commands.choices["completion"].add_argument("shell", choices=("bash", "zsh", "fish"), help="the shell")
     return top
+
+
+def _configs(**_: object) -> list[str]:
+    """Names of packaged configs, which `argcomplete` offers where a config is expected."""
+    from torchsar.study.settings.text import packaged_configs
+
+    return [*packaged_configs()]
 
 
 def _folder(command: str, config: str) -> Path:
@@ -138,6 +146,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Exit status: 0 after success, 1 if stdout was closed, 2 if the input is invalid (a message
         on stderr says why), 130 if the user interrupted the command.
     """
+    if "_ARGCOMPLETE" in os.environ:  # a shell asks for the words that may follow, and nothing else is done
+        import argcomplete
+
+        argcomplete.autocomplete(parser())
     given = list(sys.argv[1:] if arguments is None else arguments)
     wrong = next((word for word in given if not _is_text(word)), None)
     if wrong is not None:
@@ -260,12 +272,12 @@ def _dispatch(options: argparse.Namespace, command: str) -> int:
 
 
 def _print(options: argparse.Namespace) -> int:
-    from torchsar.study.settings.text import experiments, find_config, packaged_configs
+    from torchsar.study.settings.text import experiments, find_config
 
     if options.command == "completion":
-        from torchsar.completion import completion
+        import argcomplete
 
-        print(completion(options.shell, parser(), packaged_configs()), end="")
+        print(argcomplete.shellcode(["torchsar"], shell=options.shell))  # pyright: ignore[reportPrivateImportUsage]
         return 0
     if options.command == "config" and options.config is not None:
         print(find_config(options.config).read_text(encoding="utf-8").replace("=../schema", "=schema"), end="")

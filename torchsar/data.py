@@ -154,7 +154,7 @@ class _Config:
     def bench(self) -> Any:
         """Radar and world."""
         try:
-            from torchsar.study.settings.cases import cases_of
+            from torchsar.study.settings.sections import cases_of
             from torchsar.study.table import load
             from torchsar.study.trials.bench import Bench
         except ImportError as error:

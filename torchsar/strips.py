@@ -18,10 +18,10 @@ from torchsar.focus.strip import StripPlan, focus_block
 from torchsar.io import StripImage, write_strip_geotiff
 from torchsar.io.strip import StripRecording, samples_checksum
 from torchsar.study.output.folder import ResultFolder, fresh_result, opened
-from torchsar.study.output.progress import Count, Ticker
+from torchsar.study.output.progress import progress
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.settings.sections import Loaded
-from torchsar.study.trials.chains import build_chains
+from torchsar.study.trials.bench import build_chains
 
 log = logging.getLogger("torchsar")
 # image lines of a chunk of the store at most
@@ -139,8 +139,7 @@ class _Strip:
         if image is not None:
             image.refuse_another(identity)
         done = [] if image is None else [keep for _, keep in plan.blocks if image.is_finished(self._rows(image, keep))]
-        count = Count("lines", plan.n_lines, sum(keep.stop - keep.start for keep in done))
-        with Ticker(count.say):
+        with progress(plan.n_lines, "lines", sum(keep.stop - keep.start for keep in done)) as count:
             for read, keep in plan.blocks:
                 raw = self.recording.recording(read.start, read.stop).signal.data
                 checksum = samples_checksum(raw)
@@ -155,7 +154,7 @@ class _Strip:
                     axes, dtype = self._axes(block, plan, keep), block.data.dtype
                     image = StripImage.create(path, axes, dtype, identity, about, self._chunk_lines)
                 image.write(self._rows(image, keep), block.data.cpu(), checksum)
-                count.advance(keep.stop - keep.start)
+                count.update(keep.stop - keep.start)
         assert image is not None
         return image
 

@@ -103,7 +103,7 @@ from torchsar.scene import (
 )
 from torchsar.scene.fluctuation import Tones
 from torchsar.scene.movers import Bend, Movers
-from torchsar.study.names import factories
+from torchsar.study.names import registry as factories
 
 DOUBLE = torch.complex128
 TRIALS = 3  # no other dim of these simulations has three entries

@@ -30,7 +30,7 @@ FLOWN = {
         "trials": 2,
         "scene": {"points": {"kind": "points", "azimuth_m": [0.0, 10.0], "range_m": [0.0, -12.0]}},
         "transmitter": {
-            "nominal": {"kind": "straight", "start_m": [-3535.0, -48.0, 3535.0], "velocity_m_s": [0.0, 400.0, 0.0]}
+            "nominal": {"kind": "straight_path", "start_m": [-3535.0, -48.0, 3535.0], "velocity_m_s": [0.0, 400.0, 0.0]}
         },
         "noise": {"snr_db": 10.0},
     },

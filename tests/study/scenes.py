@@ -18,7 +18,7 @@ from torchsar.study.settings.sections import Loaded
 from torchsar.study.table import load
 from torchsar.study.trials.bench import Bench
 
-CORRECT = {"stage": "pulse_phase_correct", "uses": {"phase_rad": "phase"}}
+CORRECT = {"stage": "correct_pulse_phase", "uses": {"phase_rad": "phase"}}
 IMAGE = {"stage": "azimuth_transform"}
 
 _TRUE_FOCUS = {
@@ -56,7 +56,7 @@ ISAL: dict = {
         "pulses": 96,
         "samples": 64,
         "scene": {"field": {"kind": "random_points", "count": 40, "azimuth_extent_m": 0.15, "range_extent_m": 0.05}},
-        "start_phase": {"pulses": {"kind": "uniform"}},
+        "start_phase": {"pulses": {"kind": "uniform_start_phase"}},
         "noise": {"snr_db": 15.0},
     },
     "processor": {
@@ -92,8 +92,8 @@ ISAL_ROTATION: dict = {
     "processor": {
         "ideal": {"input": "clean", "stages": _KNOWN},
         "none": {"stages": {"image": {"stage": "matched_fourier"}}},
-        "coarse": {"stages": {"rotation": {"stage": "rotation_coarse"}, "image": FOUND_ROTATION["image"]}},
-        "recommended": {"stages": {"rotation": {"stage": "rotation"}, **FOUND_ROTATION}},
+        "coarse": {"stages": {"rotation": {"stage": "coarse_rotation"}, "image": FOUND_ROTATION["image"]}},
+        "recommended": {"stages": {"rotation": {"stage": "uneven_rotation"}, **FOUND_ROTATION}},
     },
     "metrics": {"reference": "ideal", "published": {"omega_error_percent": {"one": {"coarse": 1.0}}}},
 }
@@ -153,15 +153,19 @@ SAL: dict = {
 
 TRUE_MOTION = {name: f"truth.{name}" for name in ("u_r_m_s", "u_a_m_s", "y0_m")}
 FOUND_MOTION = dict.fromkeys(TRUE_MOTION, "velocity")
-VELOCITY = {"stage": "moving_point_velocity", "dwell_s": 4.5, "u_r_reach_m_s": 15.0, "u_a_reach_m_s": 3.0}
+VELOCITY = {
+    "stage": "moving_point_velocity",
+    "aperture": {"kind": "dwell", "duration_s": 4.5},
+    "search": {"u_r_m_s": 15.0, "u_a_m_s": 3.0},
+}
 
 
 def channels_method(uses: dict, bands: int = 2, before: dict | None = None) -> dict:
     """A chain of a moving point: its motion known or found, bands rebuilt, the target focused."""
-    migration = {"stage": "migration_correct", "kind": "static_bulk", "whole_swath": False, "uses": uses}
-    stages = {"transmit": {"stage": "transmit_range_remove"}, **(before or {}), "migration": migration}
-    stages["rebuild"] = {"stage": "rebuild_bands", "bands": bands, "uses": uses}
-    stages["focus"] = {"stage": "focus_target", "bandwidth_hz": 337.5, "uses": uses}
+    migration = {"stage": "correct_migration", "migration": {"kind": "static_bulk", "whole_swath": False}, "uses": uses}
+    stages = {"transmit": {"stage": "remove_transmit_range"}, **(before or {}), "migration": migration}
+    stages["rebuild"] = {"stage": "reconstruct", "rebuild": {"kind": "least_squares", "bands": bands}, "uses": uses}
+    stages["focus"] = {"stage": "focus_azimuth", "bandwidth_hz": 337.5, "uses": uses}
     return {"oracle": uses == TRUE_MOTION, "stages": stages}
 
 
@@ -210,7 +214,7 @@ FLOW = {
 def scene_method(image: dict, uses: dict | None = None) -> dict:
     """A chain of a sea with ships, its image with the true motions where they are given."""
     last = {**image, "uses": uses} if uses else image
-    return {"oracle": uses is not None, "stages": {"transmit": {"stage": "transmit_range_remove"}, "image": last}}
+    return {"oracle": uses is not None, "stages": {"transmit": {"stage": "remove_transmit_range"}, "image": last}}
 
 
 SHIP = {"u_r_m_s": 8.0, "scr_db": 20.0, "length_m": 40.0, "range_cells": 2, "count": 6}
@@ -250,7 +254,11 @@ PATH: dict = {
             "field": {"kind": "random_points", "count": 30, "azimuth_extent_m": 14.0, "range_extent_m": 14.0},
         },
         "transmitter": {
-            "nominal": {"kind": "straight", "start_m": [-1500.0, -48.0, 1500.0], "velocity_m_s": [0.0, 100.0, 0.0]},
+            "nominal": {
+                "kind": "straight_path",
+                "start_m": [-1500.0, -48.0, 1500.0],
+                "velocity_m_s": [0.0, 100.0, 0.0],
+            },
             "x": {"sway": {"kind": "sinusoid", "amplitude_m": 0.3, "frequency_hz": 1.0}},
         },
         "navigation": {"x": _WALK, "latency_s": 0.0},

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -10,8 +9,8 @@ import pytest
 from tests.study.tiny import TINY, write_tiny
 from torchsar.core import Draws
 from torchsar.study.commands.sweep import SweepTrial, sweep_grid
-from torchsar.study.settings.cases import cases_of
 from torchsar.study.settings.errors import ConfigError
+from torchsar.study.settings.sections import cases_of
 from torchsar.study.settings.text import dump, override, packaged_configs, parse
 from torchsar.study.table import load
 from torchsar.study.trials.bench import Bench
@@ -60,26 +59,20 @@ def test_yaml_reads_numbers_as_numbers(text: str, value: object) -> None:
     assert type(parse(text, "text")) is type(value)
 
 
-LARGE = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
-    f"{new}: &{new} [{', '.join([f'*{old}'] * 10)}]\n" for old, new in pairwise("abcdefgh")
-)
-
-
 @pytest.mark.parametrize(
     "text, said",
     [
         ("[" * 600 + "]" * 600, "line 1: .*more than 50 parts inside each other"),
         ("\n".join("  " * i + "a:" for i in range(600)), "line 50: .*more than 50 parts"),
-        (LARGE, "more than 200000 values with all repetitions"),
-        ("a: &a [*a]", "more than 200000 values with all repetitions"),
-        ("a: &a {b: *a}", "more than 200000 values with all repetitions"),
+        ("a: &a [*a]", "not readable as YAML"),
+        ("a: &a {b: *a}", "not readable as YAML"),
         ('a: "\\ud800"', "not readable as YAML"),
         ("? [1, 2]\n: 3", "a key must be a word"),
         ("'': 3", "a key must be a word"),
         ("a: " + "9" * 5000, "not readable as YAML"),
         ("a: !!python/object:os.system {}", "not readable as YAML"),
     ],
-    ids=range(10),
+    ids=range(9),
 )
 def test_documents_that_no_step_could_use_are_refused(text: str, said: str) -> None:
     with pytest.raises(ConfigError, match=said) as error:
@@ -205,7 +198,7 @@ def test_unknown_config_names_what_there_is() -> None:
         (["=3"], ["is not an override"]),
         ([".seed=3"], ["'.seed=3' is not an override"]),
         (["world=3"], ["'world' has the value 3", "mapping of keys"]),
-        (["world.scene={}"], ["world", "world needs at least one scene"]),
+        (["world.scene={}"], ["world", "world needs at least 1 scene"]),
         (["data.file=/tmp"], ["data.file", "'/tmp' is no file"]),
         (["world.lines=1000000000000"], ["world", "raw data of a trial take 1.02e+06 GB"]),
         (["world.scene.points.azimuth_m=[1.0, 2.0, 3.0]"], ["world.scene.points", "as many ranges", "[3, 2]"]),
@@ -245,17 +238,25 @@ def test_mistakes_are_named(tmp_path: Path, assignments: list[str], expected: li
             ["'aux.true_doppler_hz' is now called 'truth.doppler_hz'"],
         ),
         (
-            ["processor.recommended.stages.r={stage: rotation_entropy, method: descent, order: 2}"],
+            ["processor.recommended.stages.r={stage: entropy_rotation, method: descent, order: 2}"],
             ["'processor.recommended.stages.r.order' is now called 'objective.order'"],
         ),
         (["world.noise.order=2"], ["'world.noise.order' is not known"]),
         (
             ["processor.recommended.stages.r.stage=rotation_genetic"],
-            ["processor.recommended.stages.r: ", "now called 'stage: rotation_entropy, method: genetic'"],
+            ["processor.recommended.stages.r: ", "now called 'stage: entropy_rotation, method: genetic'"],
         ),
         (
             ["processor.recommended.stages.r.stage=rotation_phase_fit"],
-            ["'stage: rotation_phase_fit' is now called 'stage: rotation_coarse, fits: 4'"],
+            ["'stage: rotation_phase_fit' is now called 'stage: coarse_rotation, fits: 4'"],
+        ),
+        (
+            ["processor.recommended.stages.r.stage=pulse_phase_correct"],
+            ["'stage: pulse_phase_correct' is now called 'stage: correct_pulse_phase'"],
+        ),
+        (
+            ["processor.recommended.stages.r={stage: interferometry, dwell_s: 4.5}"],
+            ["stages.r.dwell_s' is now called 'aperture.duration_s'"],
         ),
     ],
 )
@@ -268,42 +269,23 @@ def test_old_names_are_given_the_new_ones(tmp_path: Path, assignments: list[str]
 MISTAKEN = {
     "stripmap_damaged": [
         ("radar.prf_hz=0.4", "1 Hz to 1e+08 Hz", "did you mean 0.4 kHz, which is 400?"),
-        ("radar.prf_hz=2.0", "Doppler band of an aperture over the pulse rate", "radar.prf_hz (2 Hz) to 7.47 Hz"),
-        ("radar.velocity_m_s=7.0", "radar.velocity_m_s (7 m/s)", "at least 0.01"),
-        ("radar.near_range_m=700.0", "radar.near_range_m (700 m)", "at most 100"),
         ("radar.pulse.duration_s=3.0", "1e-10 s to 0.1 s", "did you mean 3 ms"),
-        ("radar.sampling_hz=250e9", "the sampling rate over the bandwidth is 1.25e+03", "at most 500"),
-        ("world.scene.points.range_m=[7e6]", "world.scene.points.range_m is 7e+06 m", "at most 1e+06 m"),
-        ("world.noise.snr_db=2000.0", "2000 dB", "at most 400 dB"),
-        ("sweep.world.noise.snr_db=[0.0, 2000.0]", "2000 dB", "at most 400 dB"),
+        ("radar.near_range_m=0.7", "1 m to 1e+08 m", "did you mean 0.7 km"),
+        ("world.noise.snr_db=2000.0", "2000 dB", "0 dB to 400 dB"),
+        ("sweep.world.noise.snr_db=[0.0, 2000.0]", "2000 dB", "0 dB to 400 dB"),
     ],
-    "isal_table1": [
-        ("radar.carrier_hz=193.4", "3e+08 Hz to 1e+16 Hz", "did you mean 193.4 GHz"),
-        ("radar.prf_hz=2.0", "the Doppler band of the scene over the pulse rate", "2 Hz"),
-        ("radar.pulse_s=0.1", "the share of time that a pulse takes is 200", "at most 1"),
-        ("world.scene.aircraft.length_m=190.0", "190 m", "at most 100"),
-    ],
+    "isal_table1": [("radar.carrier_hz=193.4e3", "2e+07 Hz to 1e+16 Hz", "did you mean 193400 kHz")],
     "isal_satellite": [
-        ("radar.wavelength_m=1.55", "3e-08 m to 1 m", "did you mean 1.55 mm"),
-        ("radar.prf_hz=500.0", "500 Hz", "at most 100"),
-        ("world.rotation.omega_rad_s=20000.0", "20000 rad/s", "at most 1000 rad/s"),
+        ("radar.wavelength_m=1550.0", "3e-08 m to 15 m", "did you mean 1550 mm"),
+        ("world.rotation.omega_rad_s=20000.0", "20000 rad/s", "0 rad/s to 1000 rad/s"),
     ],
-    "sal_points": [
-        ("radar.wavelength_m=1.55", "3e-08 m to 0.0003 m", "did you mean 1.55 um, which is 1.55e-06?"),
-        ("radar.period_s=16.0", "1e-08 s to 0.01 s", "did you mean 16 us"),
-        ("world.motion.slow.amplitude_m=160.0", "160 m", "at most 0.1 m"),
-    ],
+    "sal_points": [("radar.period_s=16.0", "1e-08 s to 0.01 s", "did you mean 16 us")],
     "geo_point_targets": [
         ("radar.prf_hz=0.18", "0.18 Hz", "did you mean 0.18 kHz, which is 180?"),
-        ("radar.speed_m_s=0.3", "0.3 m/s", "5 m/s to 2000 m/s"),
-        ("world.targets.at_2.u_r_m_s=2e4", "20000 m/s", "at most 2000 m/s"),
+        ("world.targets.at_2.u_r_m_s=4e4", "40000 m/s", "0 m/s to 30000 m/s"),
     ],
     "geo_velocity_prf": [("sweep.radar.prf_hz=[180.0, 0.18]", "0.18 Hz", "did you mean 0.18 kHz")],
-    "geo_ocean": [
-        ("radar.reference_range_m=5.7", "5.7 m", "did you mean 5.7 km, which is 5700?"),
-        ("world.gate.duration_s=4500.0", "4500 s", "at most 100"),
-        ("world.sea.cell_m=[2e4, 20.0]", "20000 m", "at most 1000 m"),
-    ],
+    "geo_ocean": [("radar.reference_range_m=5.7", "5.7 m", "did you mean 5.7 km, which is 5700?")],
 }
 
 

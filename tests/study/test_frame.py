@@ -17,8 +17,8 @@ from torchsar.cli import main
 from torchsar.compensate.pulse_phase import Sca
 from torchsar.core import Axis, Draws, Signal, numpy_random
 from torchsar.study.commands.sweep import SweepTrial
-from torchsar.study.settings.cases import cases_of
 from torchsar.study.settings.errors import ConfigError
+from torchsar.study.settings.sections import cases_of
 from torchsar.study.table import load, systems
 from torchsar.study.trials import bench as benches
 from torchsar.study.trials.batch import Batch, summary

@@ -29,9 +29,9 @@ from torchsar.study.table import load
 from torchsar.study.trials.bench import Bench
 
 ALONE = {"p1": {"u_r_m_s": 10.0}}
-FIRST = {"transmit": {"stage": "transmit_range_remove"}}
+FIRST = {"transmit": {"stage": "remove_transmit_range"}}
 ESTIMATORS = {
-    "ati": {"stages": {**FIRST, "velocity": {"stage": "interferometry", "dwell_s": 4.5}}},
+    "ati": {"stages": {**FIRST, "velocity": {"stage": "interferometry", "aperture": VELOCITY["aperture"]}}},
     "recommended": {"stages": {**FIRST, "velocity": {**VELOCITY, "u_a_m_s": 0.0}}},
 }
 ORACLE = {"processor": {"recommended": GEO["processor"]["oracle"]}, "metrics": None}
@@ -88,7 +88,7 @@ def test_two_dimensions_give_the_figures_of_one(tmp_path: Path) -> None:
 
 
 def test_fast_targets_keep_one_line_by_their_walk(tmp_path: Path) -> None:
-    velocity = {**VELOCITY, "u_r_reach_m_s": 40.0, "u_a_reach_m_s": 1.0}
+    velocity = {**VELOCITY, "search": {"u_r_m_s": 40.0, "u_a_m_s": 1.0}}
     fast = world("geo", pulses=900, samples=64, targets={"p": {"u_r_m_s": 25.0}}, noise={"snr_db": 5.0})
     processor = {"recommended": channels_method(FOUND_MOTION, before={"velocity": velocity})}
     bench = bench_of(tmp_path, "geo", world=fast, processor=processor, metrics=None)
@@ -185,8 +185,10 @@ def test_a_sweep_follows_one_target(tmp_path: Path) -> None:
 
 
 def test_singular_speeds_are_refused_or_crossed_unharmed(tmp_path: Path) -> None:
-    paper = {"stage": "alternate_velocity", "bandwidth_hz": 337.5, "dwell_s": 4.5, "step_m_s": 2.0}
-    best = channels_method(FOUND_MOTION, before={"velocity": {**VELOCITY, "u_a_reach_m_s": 14.0}})
+    paper = {"stage": "alternate_velocity", "bandwidth_hz": 337.5, "aperture": VELOCITY["aperture"], "step_m_s": 2.0}
+    best = channels_method(
+        FOUND_MOTION, before={"velocity": {**VELOCITY, "search": {"u_r_m_s": 15.0, "u_a_m_s": 14.0}}}
+    )
     given = {"world": world("geo", targets={"p": {"u_r_m_s": 10.0, "u_a_m_s": 12.0}}), "metrics": None}
 
     def outcomes(method: dict):
@@ -194,7 +196,7 @@ def test_singular_speeds_are_refused_or_crossed_unharmed(tmp_path: Path) -> None
         return bench_of(tmp_path, "geo", processor=processor, **given).batch(Draws(1, "run", [0])).outcomes
 
     assert "at a pulse rate of 180 Hz and a speed past the target of 288 m/s" in outcomes({})["paper"].failed
-    found = outcomes({"method": "mmse"})
+    found = outcomes({"rebuild": {"kind": "minimum_mean_square", "bands": 3}})
     assert all(bool(torch.isfinite(v.double()).all()) for o in found.values() for v in o.metrics.values())
     assert abs(float(found["recommended"].metrics["u_r_error_m_s"])) < 0.2
 

@@ -147,7 +147,7 @@ def test_a_recording_that_is_not_named_is_asked_for_by_its_kind() -> None:
 
 
 def test_all_corrections_of_a_chain_are_judged_together(tmp_path: Path) -> None:
-    rest = {"stage": "pulse_phase_correct", "uses": {"phase_rad": "rest"}}
+    rest = {"stage": "correct_pulse_phase", "uses": {"phase_rad": "rest"}}
     again = {"phase": {"stage": "sca"}, "correct": CORRECT, "rest": {"stage": "autofocus"}, "remove": rest}
     pga = {"stage": "pga", "kernel": "ml", "uses": {"start": "first.phase_rad"}}
     started = {"first": {"stage": "sca"}, "phase": pga, "correct": {**CORRECT, "in_doubt": "apply"}}

@@ -123,7 +123,7 @@ class Home:
             assert ours >= {"config.yaml", "report.html", "arrays.zarr" if command == "run" else "results.zarr"}
         elif command in ("run", "sweep"):
             assert ours <= {STATE, "results.zarr"}, ours
-        assert not (out / STATE / "new").exists() and not (out / STATE / "journal.json").exists()
+        assert not (out / STATE / "new").exists()
 
 
 def attack(home: Home, source: random.Random, seed: int) -> str:

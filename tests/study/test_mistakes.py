@@ -45,6 +45,9 @@ def rotating(**changes: object) -> dict:
     return {"world": world("isal_rotation", **changes), "processor": kept}
 
 
+FOUR = {"kind": "least_squares", "bands": 4}
+
+
 def alone(image: dict, **changes: object) -> dict:
     return {"processor": {"recommended": {"stages": {"image": image}}}, "metrics": None, **changes}
 
@@ -108,7 +111,7 @@ MISTAKES = [
         {"world": world("isal", impairments={"lost": {"kind": "lost_lines", "count": 3}})},
         "did you mean 'lost_pulses'",
     ),
-    ("isal", {"radar": radar("isal", carrier_hz=1e-300)}, "waves short enough to show the shape of a target"),
+    ("isal", {"radar": radar("isal", carrier_hz=1e-300)}, "should be 2e+07 Hz to 1e+16 Hz"),
     # isal_rotation
     ("isal_rotation", {"radar": radar("isal_rotation", carrier_hz=1.9e14)}, "give one of carrier_hz and wavelength_m"),
     ("isal_rotation", {"radar": radar("isal_rotation", wavelength_m=None)}, "give one of carrier_hz and wavelength_m"),
@@ -133,7 +136,7 @@ MISTAKES = [
     ),
     (
         "isal_rotation",
-        methods("isal_rotation", odd={"stages": {"rotation": {"stage": "rotation"}}}),
+        methods("isal_rotation", odd={"stages": {"rotation": {"stage": "uneven_rotation"}}}),
         "processor.odd, whose last stage gives the axes ('pulse', 'range'), not an image",
     ),
     (
@@ -148,7 +151,7 @@ MISTAKES = [
             odd={
                 "stages": {
                     "rotation": {
-                        "stage": "rotation_entropy",
+                        "stage": "entropy_rotation",
                         "method": "genetic",
                         "low": [0.018, 9.0],
                         "high": [0.022, 11.0],
@@ -190,7 +193,7 @@ MISTAKES = [
         {"world": world("sal", motion={"drift": {"kind": "drift", "velocity_m_s": float("nan")}})},
         "it should be a finite number",
     ),
-    ("sal", {"world": world("sal", **points([0.0], [-4000.0]))}, "the Doppler band of the scene over the period rate"),
+    ("sal", {"world": world("sal", **points([0.0], [-4000.0]))}, "lies behind the ladar"),
     ("sal", {"world": world("sal", **points([0.0], [100.0]))}, "beat frequencies that alias"),
     (
         "sal",
@@ -206,7 +209,7 @@ MISTAKES = [
     ),
     (
         "sal",
-        {"world": world("sal", log_amplitude={"kind": "scintillation", "rms": -1.0})},
+        {"world": world("sal", log_amplitude={"kind": "log_amplitude", "rms": -1.0})},
         "world.log_amplitude: rms",
     ),
     (
@@ -259,7 +262,7 @@ MISTAKES = [
     ),
     (
         "geo",
-        alone({"stage": "intensity_ratio", "bandwidth_hz": 600.0}),
+        alone({"stage": "signal_intensity_ratio", "bandwidth_hz": 600.0}),
         "3 bands of 180 Hz leave nothing outside 600 Hz",
     ),
     ("geo", alone({"stage": "omega_k"}), "a radar of this system does not have"),
@@ -273,12 +276,19 @@ MISTAKES = [
     ("geo_ocean", {"world": world("geo_ocean", pulses=180)}, "record is 1 s, and must be at least 2 s"),
     (
         "geo_ocean",
-        {"processor": {"recommended": scene_method({"stage": "rebuild_bands"})}, "metrics": None},
+        {"processor": {"recommended": scene_method({"stage": "reconstruct"})}, "metrics": None},
         "end the chain with movers_image or stationary_image",
     ),
     (
         "geo_ocean",
-        {"processor": {"recommended": scene_method({"stage": "stationary_image", "bands": 4})}, "metrics": None},
+        {
+            "processor": {
+                "recommended": scene_method(
+                    {"stage": "stationary_image", "rebuild": {"kind": "least_squares", "bands": 4}}
+                )
+            },
+            "metrics": None,
+        },
         "4 Doppler bands cannot be separated by 3 channels",
     ),
     (

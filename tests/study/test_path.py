@@ -15,8 +15,8 @@ from torchsar.radar import LIGHT_M_S
 from torchsar.study.commands.requires import refuse_beyond_limits
 from torchsar.study.commands.sweep import SweepTrial
 from torchsar.study.montecarlo import sweep
-from torchsar.study.settings.cases import cases_of
 from torchsar.study.settings.errors import ConfigError
+from torchsar.study.settings.sections import cases_of
 from torchsar.study.table import load
 from torchsar.study.trials.bench import Bench
 
@@ -128,7 +128,10 @@ def test_errors_are_added_to_a_recorded_path_and_corrected(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("changes", "match"),
     [
-        ({"transmitter": {"nominal": {"kind": "straigt"}}}, "world.transmitter.nominal.kind.*did you mean 'straight'"),
+        (
+            {"transmitter": {"nominal": {"kind": "straigt"}}},
+            "transmitter.nominal.kind.*did you mean 'straight_path'",
+        ),
         ({"transmitter": {**PATH["world"]["transmitter"], "x": {"a": {"kind": "jiter"}}}}, "did you mean 'jitter'"),
         ({"navigation": {"latency_s": 0.7}}, "world.navigation.latency_s|latency_s of a navigation"),
         ({"beam": {"width_deg": 200.0}}, "between 0 and 180 degrees"),
@@ -157,7 +160,7 @@ def test_a_pulse_rate_below_the_band_of_the_beam_is_named(tmp_path: Path) -> Non
 def test_a_motion_log_is_flown(tmp_path: Path) -> None:
     rows = (f"{t / 50:.2f},-1500,{100 * t / 50 - 48},1500" for t in range(80))
     (tmp_path / "log.csv").write_text("\n".join(["time_s,x,y,z", *rows]))
-    nominal = {"kind": "recorded", "file": str(tmp_path / "log.csv")}
+    nominal = {"kind": "recorded_path", "file": str(tmp_path / "log.csv")}
     own = {**PATH["world"]["transmitter"], "nominal": nominal}
     found = metrics_of(bench_of(tmp_path, "path", world=world("path", transmitter=own)))
     straight = metrics_of(bench_of(tmp_path, "path"))

@@ -34,10 +34,10 @@ SAL_IMAGE = {
 }
 PHASES = {
     "phase": {"stage": "pga", "kernel": "ml"},
-    "correct": {"stage": "pulse_phase_correct", "uses": {"phase_rad": "phase"}},
+    "correct": {"stage": "correct_pulse_phase", "uses": {"phase_rad": "phase"}},
 }
 ROTATION = {
-    "rotation": {"stage": "rotation"},
+    "rotation": {"stage": "uneven_rotation"},
     "range": {"stage": "range_phase", "uses": dict.fromkeys(("omega_rad_s", "warp_k", "yc_m"), "rotation")},
     "image": {"stage": "matched_fourier", "uses": {"warp_k": "rotation"}},
 }
@@ -52,8 +52,12 @@ GEO_RADAR = {
     "wave_speed_m_s": 3e8,
     "orbit": {},
 }
-REMOVED = {"transmit": {"stage": "transmit_range_remove"}}
-VELOCITY = {"stage": "moving_point_velocity", "dwell_s": 1.5, "u_r_reach_m_s": 15.0, "u_a_reach_m_s": 3.0}
+REMOVED = {"transmit": {"stage": "remove_transmit_range"}}
+VELOCITY = {
+    "stage": "moving_point_velocity",
+    "aperture": {"kind": "dwell", "duration_s": 1.5},
+    "search": {"u_r_m_s": 15.0, "u_a_m_s": 3.0},
+}
 PHASE_ERRORS = {
     "white": {"kind": "white_phase", "limit_rad": 1.0},
     "walk": {"kind": "phase_walk", "step_rad": 0.3},
@@ -107,7 +111,7 @@ CONFIGS: dict[str, tuple[Tree, Tree, Tree, Tree]] = {
                 "field": {"kind": "random_points", "count": 10, "azimuth_extent_m": 0.15, "range_extent_m": 0.02}
             },
             "motion": SHAKEN,
-            "start_phase": {"pulses": {"kind": "normal", "sigma_rad": 0.3}},
+            "start_phase": {"pulses": {"kind": "start_phase", "sigma_rad": 0.3}},
             "noise": {"snr_db": 15.0},
         },
         {**PHASES, "image": {"stage": "azimuth_transform"}},
@@ -197,7 +201,7 @@ RICH: dict[str, Tree] = {
         "doppler_hz": None,
         "squint_deg": 0.5,
         "impairments": {
-            "response": {"kind": "channel_response", "cubic_rad": 1.2, "ripple_rad": 0.5, "slope_db": 3.0},
+            "response": {"kind": "smooth_response", "cubic_rad": 1.2, "ripple_rad": 0.5, "slope_db": 3.0},
             "imbalance": {"kind": "channel_imbalance", "gain": [1.0, 1.1], "phase_rad": [0.05, 0.1]},
             "tone": {"kind": "tone", "over_signal_db": 10.0, "frequency_hz": 11e6, "drift_hz": 1e6, "share": 0.5},
             "jitter": {"kind": "periodic_jitter", "offset_samples": [-0.03, 0.1], "pilot_snr_db": None},
@@ -208,7 +212,7 @@ RICH: dict[str, Tree] = {
     "isal": {"impairments": PHASE_ERRORS, "fidelity": {"kind": "dechirped", "track_m": [1e-5, 1e-4]}},
     "isal_rotation": {"motion": SHAKEN, "impairments": PHASE_ERRORS},
     "sal": {
-        "log_amplitude": {"kind": "scintillation", "rms": 0.1},
+        "log_amplitude": {"kind": "log_amplitude", "rms": 0.1},
         "sweep_error": {"kind": "polynomial", "up_hz": [1e4, 1e5], "down_hz": [1e4, -1e5]},
     },
     "geo": {
@@ -216,7 +220,7 @@ RICH: dict[str, Tree] = {
         "transmit_range": [-200.0, 0.1],
         "impairments": {
             "channels": {"kind": "channel_errors", "gain_db": [0.1, 1.0, -1.0], "phase_rad": [0.1, 0.2, 0.3]},
-            "clocks": {"kind": "clock_errors", "phase_rad": [0.1, 0.2], "phase_walk_rad": 0.05},
+            "clocks": {"kind": "synchronisation_error", "phase_rad": [0.1, 0.2], "phase_walk_rad": 0.05},
         },
     },
     "geo_ocean": {},

@@ -20,8 +20,7 @@ from torchsar.core import Axis, Signal
 from torchsar.metrics.image import rolled_to
 from torchsar.metrics.impulse import impulse_response
 from torchsar.study.output.numbers import number, quantity, scale_of
-from torchsar.study.output.pictures import draw_all
-from torchsar.study.output.report import run_fields
+from torchsar.study.output.report import draw_all, run_fields
 from torchsar.study.trials.cuts import about_peak, finer, impulse_cuts
 from torchsar.study.trials.system import Column
 

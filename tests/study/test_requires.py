@@ -17,8 +17,8 @@ from torchsar.study.commands.requires import needs
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.systems.stripmap.choices import probe_of
 from torchsar.study.table import SYSTEMS, load
-from torchsar.study.trials.auto import choices_of
 from torchsar.study.trials.bench import Bench
+from torchsar.study.trials.choice import choices_of
 
 ROOT = Path(__file__).parents[2]
 ACCURACY = script("requires_accuracy")

@@ -29,7 +29,7 @@ def outcomes_of(folder: Path, *overrides: str, trials: int = 2, **changes: objec
 
 def test_rotations_are_found_and_images_reach_the_ideal(tmp_path: Path) -> None:
     genetic = {
-        "rotation": {"stage": "rotation_entropy", "method": "genetic", **BOX, "population": 6, "generations": 3},
+        "rotation": {"stage": "entropy_rotation", "method": "genetic", **BOX, "population": 6, "generations": 3},
         **FOUND_ROTATION,
     }
     processor = {**ISAL_ROTATION["processor"], "genetic": {"stages": genetic}}
@@ -72,7 +72,7 @@ def test_scene_and_noise_have_seeds_of_their_own(tmp_path: Path) -> None:
 
 
 def test_errors_of_a_sweep_stay_above_the_bound_and_are_predicted(tmp_path: Path) -> None:
-    processor = {"recommended": {"stages": {"rotation": {"stage": "rotation"}}}}
+    processor = {"recommended": {"stages": {"rotation": {"stage": "uneven_rotation"}}}}
     changes = {"processor": processor, "metrics": None, "precision": "complex128"}
     trial, key = SweepTrial(loaded_as(tmp_path, "isal_rotation", **changes)), "world.noise.snr_db"
     record = sweep(trial, {key: [0.0, 20.0]}, batched=[key], trials=4, seed=3, chunk=8)
@@ -88,7 +88,7 @@ def test_errors_of_a_sweep_stay_above_the_bound_and_are_predicted(tmp_path: Path
 
 def test_of_a_true_zero_there_is_no_percentage(tmp_path: Path) -> None:
     """Cases of one sweep: a constant rate has an error of k1 in 1/s, any other one in percent."""
-    processor = {"recommended": {"stages": {"rotation": {"stage": "rotation"}}}}
+    processor = {"recommended": {"stages": {"rotation": {"stage": "uneven_rotation"}}}}
     laws = {"constant": [0.0, 0.0], "changing": [10.0, 1000.0]}
     rows = {}
     for name, law in laws.items():

@@ -167,9 +167,9 @@ def test_everything_that_a_world_may_hold_is_built(tmp_path: Path, monkeypatch: 
     full = world(
         "sal",
         motion=motion,
-        log_amplitude={"kind": "scintillation", "rms": 0.1},
-        sweep_error={"kind": "sinusoid", "amplitude_hz": 1e6, "frequency_hz": 5e4},
-        calibration={"kind": "fibre", "delay_s": 5e-8},
+        log_amplitude={"kind": "log_amplitude", "rms": 0.1},
+        sweep_error={"kind": "sinusoid_sweep_error", "amplitude_hz": 1e6, "frequency_hz": 5e4},
+        calibration={"kind": "calibration_fibre", "delay_s": 5e-8},
         gate_m=[1.0, 2.0],
         impairments={"adc": {"kind": "quantiser", "bits": 8}},
     )

@@ -7,7 +7,6 @@ from __future__ import annotations
 import errno
 import json
 import shutil
-import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,13 +17,11 @@ import torch
 
 from tests.study.tiny import write_tiny
 from torchsar.cli import main
-from torchsar.core import Draws
 from torchsar.study.montecarlo import Stop, read_sweep, sweep
-from torchsar.study.montecarlo.engines import _refuse_unsendable, engine, refuse_unguarded
+from torchsar.study.montecarlo.engines import engine
 from torchsar.study.montecarlo.grid import address, check_name, make_grid
+from torchsar.study.montecarlo.record import summary_of
 from torchsar.study.montecarlo.store import Store
-from torchsar.study.montecarlo.summary import summary_of
-from torchsar.study.montecarlo.work import Work
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.table import load
 
@@ -317,23 +314,6 @@ def test_an_algorithm_without_the_metric_neither_succeeds_nor_fails() -> None:
 
 # --- processes
 # --------------------------------------------------------------------------------------------------
-
-
-def test_what_cannot_be_sent_is_a_sentence() -> None:
-    pytest.importorskip("cloudpickle")
-    lock = threading.Lock()
-    _refuse_unsendable(Work(lambda p, d: {}, make_grid({}), Draws(1)))
-    with pytest.raises(ConfigError, match="cannot be sent to worker processes .*lock"):
-        _refuse_unsendable(Work(lambda p, d: {"m": lock}, make_grid({}), Draws(1)))
-
-
-def test_a_script_without_its_guard_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    import multiprocessing
-
-    refuse_unguarded()
-    monkeypatch.setattr(multiprocessing.current_process(), "_inheriting", True, raising=False)
-    with pytest.raises(SystemExit, match="__name__ == '__main__'"):
-        run(workers=2)
 
 
 def test_workers_that_do_not_start_are_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,7 +20,7 @@ from torchsar.study.commands.sweep import SweepTrial, identity, sweep_grid
 from torchsar.study.montecarlo import Record, differences, read_sweep
 from torchsar.study.montecarlo.engines import InProcess
 from torchsar.study.montecarlo.loop import Plan, run_plan
-from torchsar.study.montecarlo.pictures import SweepPictures
+from torchsar.study.montecarlo.report import SweepPictures
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.settings.sections import Loaded
 from torchsar.study.systems.stripmap import error_name

@@ -15,13 +15,10 @@ import pytest
 from tests.study.scenes import draw_first_panels
 from torchsar.core import Outcome
 from torchsar.plot import axis_label
-from torchsar.study.montecarlo.pictures import SweepPictures, draw_sweep
-from torchsar.study.montecarlo.record import Record
-from torchsar.study.montecarlo.report import with_interval, write_sweep_report
-from torchsar.study.montecarlo.summary import Summary, summary_of
-from torchsar.study.output.arrays import write_json
-from torchsar.study.output.numbers import number
-from torchsar.study.output.pictures import Picture
+from torchsar.study.montecarlo.record import Record, Summary, summary_of
+from torchsar.study.montecarlo.report import SweepPictures, draw_sweep, with_interval, write_sweep_report
+from torchsar.study.output.numbers import number, write_json
+from torchsar.study.output.report import Picture
 
 GRID = {"world.noise.snr_db": (20.0, -10.0, 5.0), "world.squint_deg": (0.0, 3.0), "world.scene": ("point", "speckle")}
 SESSION = {"device": "cpu", "versions": {"torch": "2.13.0"}, "seconds": 4.0, "trials": 470}

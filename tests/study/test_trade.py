@@ -15,12 +15,11 @@ from tests.scripting import script
 from tests.study.tiny import write_tiny
 from torchsar.cli import main
 from torchsar.study.commands.trade import compared, trade
-from torchsar.study.settings.cases import cases_of
 from torchsar.study.settings.errors import ConfigError
+from torchsar.study.settings.sections import cases_of
 from torchsar.study.table import load
-from torchsar.study.trials.auto import choices_of, tolerance_of
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.choice import Alternative, Choice, Measured
+from torchsar.study.trials.choice import Alternative, Choice, Measured, choices_of, tolerance_of
 
 pytestmark = pytest.mark.usefixtures("blank_pictures")
 

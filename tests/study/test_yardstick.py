@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 
 from tests.study.scenes import bench_of, world
-from torchsar.study.trials.auto import choices_of
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.choice import Choice
+from torchsar.study.trials.choice import Choice, choices_of
 
 # largest errors in dB: what these small scenes neglect, with a few dB to spare
 BARS = {"stripmap": -15.0, "isal": -15.0, "isal_rotation": -25.0, "sal": -60.0, "geo": -30.0}
@@ -60,7 +59,7 @@ def test_omega_k_stands_beside_tiles_where_a_method_uses_it(tmp_path: Path) -> N
     methods = {"recommended": {"stages": {"image": tiles}}, "omega_k": {"stages": {"image": strip}}}
     # pulses 0.05 m apart, so that they sample the beam
     track = {
-        "nominal": {"kind": "straight", "start_m": [-1500.0, -10.0, 1500.0], "velocity_m_s": [0.0, 5.0, 0.0]},
+        "nominal": {"kind": "straight_path", "start_m": [-1500.0, -10.0, 1500.0], "velocity_m_s": [0.0, 5.0, 0.0]},
         "x": {"sway": {"kind": "sinusoid", "amplitude_m": 0.2, "frequency_hz": 0.3}},
     }
     scene = world("path", pulses=400, transmitter=track, navigation=None)

@@ -29,18 +29,9 @@ whether a device can compute             `device_fault`
 
 from torchsar.core import trees as trees  # registers signals and estimates with torch
 from torchsar.core.alternate import Alternate, Turn
-from torchsar.core.axis import Axis
 from torchsar.core.chain import Chain, Trace, Use, use
-from torchsar.core.check import (
-    checked_samples,
-    level_of,
-    power_of,
-    refuse_non_finite,
-    refuse_non_finite_values,
-    unit_level,
-)
 from torchsar.core.draws import Draws, Source
-from torchsar.core.estimate import Estimate, settle
+from torchsar.core.estimate import Estimate, Outcome, counts, settle, worst
 from torchsar.core.fft import (
     block_bytes_of,
     centred_fft,
@@ -55,6 +46,7 @@ from torchsar.core.fft import (
 )
 from torchsar.core.host import (
     check_value,
+    checked_samples,
     device_fault,
     gathered_checks,
     host_largest,
@@ -62,10 +54,14 @@ from torchsar.core.host import (
     host_values,
     is_out_of_memory,
     is_traced,
+    level_of,
+    power_of,
+    refuse_non_finite,
+    refuse_non_finite_values,
+    unit_level,
     untraced,
 )
 from torchsar.core.linear import cholesky_factor, linear_solve, matrix_inverse
-from torchsar.core.outcome import Outcome, counts, worst
 from torchsar.core.phase import (
     cis,
     linear_phasor,
@@ -76,10 +72,9 @@ from torchsar.core.phase import (
     unit_phasor,
     wrapped,
 )
-from torchsar.core.polynomials import legendre
 from torchsar.core.select import best_of, numbers_on, per_trial, take, true_positions
-from torchsar.core.signal import Recording, Signal, Truth
-from torchsar.core.spline import Spline
+from torchsar.core.signal import Axis, Recording, Signal, Truth
+from torchsar.core.spline import Spline, legendre
 from torchsar.core.stage import Stage
 from torchsar.core.stored import ArrayFile, StoredArray
 

@@ -9,8 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchsar.core.check import checked_samples
-from torchsar.core.host import is_traced
+from torchsar.core.host import checked_samples, is_traced
 from torchsar.core.signal import Signal
 
 

@@ -1,4 +1,6 @@
-"""Cubic splines through values at even or uneven knots, with their integral."""
+"""Cubic splines through values at even or uneven knots, with their integral, and orthogonal
+polynomials, with which estimators describe smooth curves.
+"""
 
 from __future__ import annotations
 
@@ -232,3 +234,26 @@ def _moved(x: Tensor, step: int) -> Tensor:
     pad = (step, 0) if step > 0 else (0, -step)
     kept = x[..., : x.shape[-1] - step] if step > 0 else x[..., -step:]
     return torch.nn.functional.pad(kept, pad)
+
+
+def legendre(u: Tensor, order: int) -> Tensor:
+    """Evaluate the Legendre polynomials of degree 0 to `order`.
+
+    >>> import torch
+    >>> from torchsar.core import legendre
+    >>> legendre(torch.tensor([0.0, 1.0]), order=2).tolist()
+    [[1.0, 0.0, -0.5], [1.0, 1.0, 1.0]]
+
+    The mean square of the polynomial of degree d over -1..1 is 1 / (2 d + 1). Differentiable.
+
+    Args:
+        u: Positions in -1..1, any shape, float.
+        order: Highest degree.
+
+    Returns:
+        Values, shape (*u.shape, order + 1).
+    """
+    terms = [torch.ones_like(u), u]
+    for k in range(1, order):
+        terms.append(((2 * k + 1) * u * terms[k] - k * terms[k - 1]) / (k + 1))
+    return torch.stack(terms[: order + 1], -1)

@@ -13,9 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchsar.core.check import checked_samples, refuse_non_finite_values
 from torchsar.core.estimate import Estimate
-from torchsar.core.host import gathered_checks
+from torchsar.core.host import checked_samples, gathered_checks, refuse_non_finite_values
 from torchsar.core.signal import Signal
 
 

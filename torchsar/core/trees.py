@@ -18,9 +18,8 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 from torch.utils.data._utils.collate import collate, default_collate_fn_map
 
-from torchsar.core.axis import Axis
 from torchsar.core.estimate import Estimate
-from torchsar.core.signal import Recording, Signal, Truth
+from torchsar.core.signal import Axis, Recording, Signal, Truth
 
 _NODES = (Tensor, Signal, Recording)
 # attribute of an object whose leaves are not tensors: its nodes and its structure

@@ -24,8 +24,7 @@ from torchsar.plot.images import (
     span,
     within,
 )
-from torchsar.plot.labels import axis_label, name_and_unit
-from torchsar.plot.style import array, save
+from torchsar.plot.style import array, axis_label, name_and_unit, save
 from torchsar.plot.sweeps import error_curves, heat_map
 
 __all__ = [

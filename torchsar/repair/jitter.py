@@ -397,7 +397,9 @@ class CorrectJitter(Stage):
     offset_samples: Tensor
 
     def __init__(
-        self, offset_samples: Tensor | None = None, method: Callable[[Tensor, Tensor], Tensor] | None = None
+        self,
+        offset_samples: Tensor | None = None,
+        method: Exact | BandLimited | Lagrange | Callable[[Tensor, Tensor], Tensor] | None = None,
     ) -> None:
         super().__init__()
         self.method = Exact() if method is None else method

@@ -18,7 +18,7 @@ import torch
 from torchsar import plot
 from torchsar.metrics.image import rolled_to
 from torchsar.reproduce.item import Check, Fact, Item, Made, Paper, in_order, number, statement
-from torchsar.study.settings.cases import cases_of
+from torchsar.study.settings.sections import cases_of
 from torchsar.study.table import load
 from torchsar.study.trials.batch import Batch
 from torchsar.study.trials.bench import Bench

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchsar.compensate.pulse_phase.imaging import Imaging
 from torchsar.core import power_of, unit_phasor, wrapped
-from torchsar.core.polynomials import legendre
+from torchsar.core.spline import legendre
 from torchsar.metrics import entropy
 from torchsar.optim import lbfgs
 from torchsar.optim.scalar import vertex

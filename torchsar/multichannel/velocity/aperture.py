@@ -117,6 +117,9 @@ class SeenAperture:
         return self.aperture.weight(radar, motion, time_s) * self.profile[(..., *[None] * more, slice(None))]
 
 
+# what stages take, and what they expect unless told otherwise
+Expected = Dwell | ElementBeam
+ELEMENT_BEAM = ElementBeam()
 # Expected amplitude of the echo of a point, centred on the time at which it is at broadside.
 Aperture = Dwell | ElementBeam | Kept | SeenAperture
 

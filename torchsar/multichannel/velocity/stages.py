@@ -13,7 +13,7 @@ from torchsar.core import Estimate, Outcome, Signal, Stage, take, unit_level
 from torchsar.multichannel.channels import checked_channels, refuse_shifted
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.velocity.along_track import along_track_velocity, interferometry
-from torchsar.multichannel.velocity.aperture import Aperture, seen_aperture
+from torchsar.multichannel.velocity.aperture import ELEMENT_BEAM, Aperture, Expected, seen_aperture
 from torchsar.multichannel.velocity.assess import outcome_of_point
 from torchsar.multichannel.velocity.bank import Search
 from torchsar.multichannel.velocity.likelihood import PointLikelihood, explained_energy, maximum_likelihood
@@ -126,7 +126,12 @@ class _Velocity(Stage):
     neutral = dict.fromkeys(UNKNOWNS, 0.0)  # a point at rest in the middle of the scene
 
     def __init__(
-        self, radar: BistaticRadar, aperture: Aperture, range_m: float | None = None, *, assess: bool = True
+        self,
+        radar: BistaticRadar,
+        aperture: Expected = ELEMENT_BEAM,
+        range_m: float | None = None,
+        *,
+        assess: bool = True,
     ) -> None:
         super().__init__()
         self.radar, self.aperture, self.range_m, self.assess = radar, aperture, range_m, assess
@@ -179,7 +184,7 @@ class Interferometry(_Velocity):
     def __init__(
         self,
         radar: BistaticRadar,
-        aperture: Aperture,
+        aperture: Expected = ELEMENT_BEAM,
         range_m: float | None = None,
         check_ambiguity: bool = True,
         *,
@@ -236,7 +241,7 @@ class AlongTrackAutofocus(_Velocity):
     def __init__(
         self,
         radar: BistaticRadar,
-        aperture: Aperture,
+        aperture: Expected = ELEMENT_BEAM,
         range_m: float | None = None,
         half_m_s: float = 20.0,
         *,
@@ -292,7 +297,7 @@ class LikelihoodVelocity(_Velocity):
     def __init__(
         self,
         radar: BistaticRadar,
-        aperture: Aperture,
+        aperture: Expected = ELEMENT_BEAM,
         range_m: float | None = None,
         unknowns: tuple[str, ...] = UNKNOWNS,
         *,
@@ -384,7 +389,7 @@ class MovingPointVelocity(_Velocity):
     def __init__(
         self,
         radar: BistaticRadar,
-        aperture: Aperture,
+        aperture: Expected = ELEMENT_BEAM,
         range_m: float | None = None,
         search: Search | None = None,
         u_a_m_s: float | None = None,

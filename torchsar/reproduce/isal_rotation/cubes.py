@@ -33,7 +33,7 @@ from torchsar.metrics import contrast, entropy
 from torchsar.reproduce.isal_rotation.common import focused, in_metres, known_of, ladar, second_order
 from torchsar.reproduce.item import Check, Fact, Item, Made, falling, number, seeds_of, statement
 from torchsar.scene import Points, PolynomialRotation, TurntableWorld
-from torchsar.study.names.factories import rotation_and_phase
+from torchsar.study.names.registry import rotation_and_phase
 
 # chosen, but for the wavelength
 RADAR = ladar(0.015, 50e3)

@@ -8,9 +8,8 @@ from torchsar.io import read_images
 from torchsar.io.export import export_images, export_recording
 from torchsar.radar import LocalFrame
 from torchsar.study.output.folder import fresh_result
-from torchsar.study.settings.cases import cases_of, key_of
 from torchsar.study.settings.errors import ConfigError
-from torchsar.study.settings.sections import Loaded
+from torchsar.study.settings.sections import Loaded, cases_of, key_of
 from torchsar.study.trials.bench import Bench
 
 

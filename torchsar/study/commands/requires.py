@@ -12,14 +12,12 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from torchsar.study.output.arrays import write_json
 from torchsar.study.output.folder import fresh_result
-from torchsar.study.settings.cases import ALL, cases_of
+from torchsar.study.output.numbers import write_json
 from torchsar.study.settings.errors import ConfigError, one_line
-from torchsar.study.settings.sections import Loaded
-from torchsar.study.trials.auto import cheapest, choices_of, tolerance_of, within
+from torchsar.study.settings.sections import ALL, Loaded, cases_of
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.choice import Choice
+from torchsar.study.trials.choice import Choice, cheapest, choices_of, tolerance_of, within
 
 log = logging.getLogger("torchsar")
 FILES = ("config.yaml", "requires.json", "requires.txt")

@@ -14,13 +14,11 @@ from torch import Tensor
 from torchsar.core import Outcome, counts
 from torchsar.io.arrays import write_arrays
 from torchsar.study.commands.requires import refuse_beyond_limits
-from torchsar.study.output.arrays import write_json
 from torchsar.study.output.folder import fresh_result
-from torchsar.study.output.pictures import draw_all
-from torchsar.study.output.progress import Steps, Ticker
-from torchsar.study.output.report import run_fields, write_page
-from torchsar.study.settings.cases import ALL, cases_of, key_of
-from torchsar.study.settings.sections import Loaded
+from torchsar.study.output.numbers import write_json
+from torchsar.study.output.progress import progress
+from torchsar.study.output.report import draw_all, run_fields, write_page
+from torchsar.study.settings.sections import ALL, Loaded, cases_of, key_of
 from torchsar.study.trials.batch import Batch, Found, Result, joined_found, joined_metrics, summary
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.system import per_trial_first
@@ -51,18 +49,18 @@ def run(loaded: Loaded, out: Path, command: str = "torchsar run", device: str = 
     began = time.perf_counter()
     with fresh_result(out, "run", FILES) as folder:
         cases = cases_of(loaded)
-        progress = Steps([])
+        with progress(0, "stages") as steps:
 
-        def announce(method: str, stage: str) -> None:
-            progress.begin(f"{method}, {stage}" if method else stage)
+            def announce(method: str, stage: str) -> None:
+                steps.set_description_str(f"{method}, {stage}" if method else stage, refresh=False)
+                steps.update()
 
-        benches = {name: Bench(case, device, announce) for name, case in cases.items()}
-        for name, bench in benches.items():
-            refuse_beyond_limits(bench, name)
-            for sentence in bench.chosen:
-                log.info("%s", sentence)
-        progress = Steps([step for bench in benches.values() for step in _steps(bench)])
-        with Ticker(lambda: progress.say()):
+            benches = {name: Bench(case, device, announce) for name, case in cases.items()}
+            for name, bench in benches.items():
+                refuse_beyond_limits(bench, name)
+                for sentence in bench.chosen:
+                    log.info("%s", sentence)
+                steps.total += len(_chunks(bench)) * (1 + sum(len(chain.stages) for chain in bench.chains.values()))
             results = {name: _case(bench, name) for name, bench in benches.items()}
         tree = metrics_tree(loaded, results)
         (folder / "config.yaml").write_text(loaded.text(), encoding="utf-8")
@@ -100,11 +98,6 @@ def _chunks(bench: Bench) -> list[range]:
     # the memory of a machine that can process one trial
     height = max(1, min(count, (256 << 20) // max(1, bench.bytes_per_trial)))
     return [range(first, min(first + height, count)) for first in range(0, count, height)]
-
-
-def _steps(bench: Bench) -> list[str]:
-    of_batch = [f"{name}, {stage}" for name, chain in bench.chains.items() for stage in chain.stages]
-    return ["simulation" if bench.recording is None else "recording", *of_batch] * len(_chunks(bench))
 
 
 def _case(bench: Bench, name: str) -> Result:

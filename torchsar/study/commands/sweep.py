@@ -25,13 +25,11 @@ from torchsar.study.montecarlo.loop import (
     open_store,
     run_plan,
 )
-from torchsar.study.montecarlo.pictures import draw_sweep
-from torchsar.study.montecarlo.record import Record
-from torchsar.study.montecarlo.report import write_sweep_report
-from torchsar.study.montecarlo.summary import summary_of
+from torchsar.study.montecarlo.record import Record, summary_of
+from torchsar.study.montecarlo.report import draw_sweep, write_sweep_report
 from torchsar.study.montecarlo.work import BOUNDS, SAVED
-from torchsar.study.output.arrays import write_json
 from torchsar.study.output.folder import opened
+from torchsar.study.output.numbers import write_json
 from torchsar.study.settings.errors import ConfigError, did_you_mean
 from torchsar.study.settings.sections import Config, Loaded, Sweep
 from torchsar.study.trials.batch import OK, Processed

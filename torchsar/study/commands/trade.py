@@ -20,17 +20,14 @@ import torch
 from torchsar import plot
 from torchsar.study.commands.requires import aligned
 from torchsar.study.memory import PeakMemory, wait_for_devices
-from torchsar.study.output.arrays import write_json
 from torchsar.study.output.folder import fresh_result
-from torchsar.study.output.numbers import MISSING, number
-from torchsar.study.output.progress import Steps, Ticker
+from torchsar.study.output.numbers import MISSING, number, write_json
+from torchsar.study.output.progress import progress
 from torchsar.study.output.report import installed_version
-from torchsar.study.settings.cases import cases_of
 from torchsar.study.settings.errors import ConfigError, one_line
-from torchsar.study.settings.sections import Loaded
-from torchsar.study.trials.auto import choices_of, tolerance_of, within
+from torchsar.study.settings.sections import Loaded, cases_of
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.choice import EXACT_DB, Alternative, Choice, Measured
+from torchsar.study.trials.choice import EXACT_DB, Alternative, Choice, Measured, choices_of, tolerance_of, within
 
 log = logging.getLogger("torchsar")
 FILES = ("config.yaml", "trade.json", "trade.txt", "figures")
@@ -90,10 +87,7 @@ def compared(choice: Choice, bench: Bench, tolerance: Mapping[str, float]) -> li
     """
     repeats = bench.config.trade.repeats
     order = [*choice.alternatives, *([] if choice.yardstick is None else [choice.yardstick])]
-    names = [f"{choice.name}: {one.name}" for one in order]
-    progress = Steps([f"{choice.name}: preparation", *names * repeats])
-    with Ticker(progress.say):
-        progress.begin(f"{choice.name}: preparation")
+    with progress(len(order) * repeats, choice.name) as runs:
         assert choice.measured is not None
         try:
             measured = choice.measured()
@@ -101,10 +95,10 @@ def compared(choice: Choice, bench: Bench, tolerance: Mapping[str, float]) -> li
             raise ConfigError(f"{bench.file}: {one_line(error)}") from error
         found = [_Tried(one, measured, bench.device) for one in order]
         for _ in range(repeats):
-            for tried, name in zip(found, names, strict=True):
+            for tried in found:
                 if not tried.failed:
-                    progress.begin(name)
                     tried.again()
+                runs.update()
     rows = [tried.row(tolerance) for tried in found]
     kept = [row for row in rows if row["within_tolerance"]]
     for row in rows:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import multiprocessing
 import signal
 import threading
 from collections.abc import Iterable, Iterator
@@ -19,14 +18,9 @@ from torchsar.study.memory import keep_freed_memory
 from torchsar.study.montecarlo.work import Chunk, Computed, Work
 from torchsar.study.settings.errors import ConfigError, one_line
 
-log = logging.getLogger("torchsar")
 Task = tuple[Chunk, int | None]
 _QUEUE = 4  # chunks submitted ahead per worker, so that no worker is idle
 _DEATHS = 10  # workers that may die with a chunk before the chunk is taken as the cause
-_UNGUARDED = (
-    "a script that starts workers is imported again by each of them; put its call of "
-    "sweep(...) below the line: if __name__ == '__main__':"
-)
 
 
 @dataclass(frozen=True)
@@ -90,7 +84,10 @@ def _on_own_gpu(work: Work, worker: Any) -> Work:
 class Distributed:
     """Engine that computes chunks (batches of trials) in the workers of a dask.distributed client.
 
-    A chunk whose worker process dies is run again by another worker.
+    A chunk whose worker process dies is run again by another worker, until ten have died with it.
+
+    Raises:
+        ConfigError: If so many workers died, most likely for want of memory.
     """
 
     client: Any
@@ -101,77 +98,30 @@ class Distributed:
     def results(self, work: Work, tasks: Iterable[Task]) -> Iterator[tuple[Chunk, Computed]]:
         from distributed import KilledWorker, as_completed
 
-        _refuse_unsendable(work)
         self.client.register_plugin(_plugin(work, self.threads, self.own), name=_PLUGIN)
         source, waiting, done = iter(tasks), {}, as_completed()
 
-        def submit(task: Task) -> None:
-            future = self.client.submit(_compute, *task, pure=False)
-            waiting[future] = task[0]
-            done.add(future)
+        def submit(count: int) -> None:
+            for chunk, fits in islice(source, count):
+                future = self.client.submit(_compute, chunk, fits, pure=False)
+                waiting[future] = chunk
+                done.add(future)
 
         try:
-            for task in islice(source, _QUEUE * max(1, self.workers)):
-                submit(task)
+            submit(_QUEUE * max(1, self.workers))
             for future in done:
-                chunk = waiting.pop(future)
-                try:
-                    computed = future.result()
-                except KilledWorker:
-                    following = [(half, len(half)) for half in _after_deaths(chunk)]
-                else:
-                    yield chunk, computed
-                    following = islice(source, 1)
-                for task in following:
-                    submit(task)
+                yield waiting.pop(future), future.result()
+                submit(1)
+        except KilledWorker as error:
+            raise ConfigError(
+                f"the workers of the sweep died one after the other ({one_line(error)}), most likely because memory "
+                "ran out; use fewer workers, a smaller chunk, or a smaller scene"
+            ) from None
         finally:
             self.client.cancel(list(waiting), force=True)
 
 
 Engine = InProcess | Distributed
-
-
-def _refuse_unsendable(work: Work) -> None:
-    """Refuse a trial that cannot be pickled, in one sentence; dask would print a long traceback."""
-    import cloudpickle
-
-    try:
-        cloudpickle.dumps(work)
-    except Exception as error:  # pickling may raise any exception
-        raise ConfigError(
-            "the trial function and its grid cannot be sent to worker processes "
-            f"({one_line(error)}); create what cannot be pickled inside the trial function"
-        ) from error
-
-
-def refuse_unguarded() -> None:
-    """End this process if it is a new worker that would start workers of its own.
-
-    A new worker process imports the user's script again. It reaches this function only if the
-    script lacks the usual guard, `if __name__ == "__main__":`. The parent process then reports
-    that its workers did not start.
-
-    Raises:
-        SystemExit: In such a process; it ends with one sentence and without a traceback.
-    """
-    if getattr(multiprocessing.current_process(), "_inheriting", False):
-        raise SystemExit(_UNGUARDED)
-
-
-def _after_deaths(chunk: Chunk) -> Iterator[Chunk]:
-    """Halves of a chunk whose workers died one after the other: the operating system kills a
-    process that takes too much memory, without an error.
-    """
-    if len(chunk) == 1:
-        raise ConfigError(
-            f"every worker that ran trial {chunk.trials[0]} died, most likely because memory ran out; "
-            "use fewer workers, or make the scene smaller"
-        )
-    log.warning(
-        "warning: the workers that ran %d trials at once died, most likely because memory ran out; trying halves",
-        len(chunk),
-    )
-    yield from chunk.pieces(-(-len(chunk) // 2))
 
 
 @contextmanager
@@ -221,7 +171,10 @@ def _local(distributed: Any, workers: int, threads: int) -> Iterator[Engine]:
         try:
             cluster = distributed.LocalCluster(n_workers=workers, memory_limit=0, **wanted)
         except RuntimeError as error:
-            raise ConfigError(f"the worker processes did not start ({one_line(error)}); {_UNGUARDED}") from None
+            raise ConfigError(
+                f"the worker processes did not start ({one_line(error)}); a script that starts workers is imported "
+                "again by each of them: put its call of sweep(...) below the line: if __name__ == '__main__':"
+            ) from None
         with cluster, distributed.Client(cluster) as client:
             yield Distributed(client, workers, threads, own=True)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import platform
+import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -17,14 +18,14 @@ import torch
 
 from torchsar.core import Draws, Source, device_fault
 from torchsar.metrics.intervals import half_width_ratio
-from torchsar.study.montecarlo.engines import Engine, Task, engine, refuse_unguarded
+from torchsar.study.montecarlo.engines import Engine, Task, engine
 from torchsar.study.montecarlo.fingerprint import fingerprint, name_of
 from torchsar.study.montecarlo.grid import Grid, make_grid
 from torchsar.study.montecarlo.record import OK, OUTCOME, Record
 from torchsar.study.montecarlo.store import Store, cut_off, empty, read_sweep
 from torchsar.study.montecarlo.work import Chunk, Computed, Trial, Work, cut, rows_of
 from torchsar.study.output.folder import ResultFolder, opened
-from torchsar.study.output.progress import Count, Ticker
+from torchsar.study.output.progress import progress
 from torchsar.study.output.report import installed_version
 from torchsar.study.settings.errors import ConfigError, did_you_mean
 
@@ -220,8 +221,6 @@ def sweep(
             open file or a lock.
         Interrupted: After Ctrl-C; finished trials are recorded in `out`, if that is given.
     """
-    if workers is not None:
-        refuse_unguarded()
     for name, good, expected, given in (
         ("trial", callable(trial), "be a function of (parameters, draws)", trial),
         ("stop", stop is None or isinstance(stop, Stop), "be a Stop, such as Stop('error_m', 0.05)", stop),
@@ -330,17 +329,16 @@ class _Run:
         known = (n for n in self.record.about.get("finished", []) if n < self.plan.trials)
         levels = sorted({*stops, *known})
         done = sum(int(self.record.done[(*p, slice(0, levels[-1]))].sum()) for points in self.points for p in points)
-        count = Count("trials", self.plan.trials * sum(map(len, self.points)), done)
-        session = self._session(engine)
+        count = progress(self.plan.trials * sum(map(len, self.points)), "trials", done)
+        session, began = self._session(engine), time.perf_counter()
         try:
-            with Ticker(count.say):
+            with count:
                 for first, last in pairwise((0, *levels)):
                     for chunk, computed in engine.results(self.work, self._tasks(first, last, engine.workers)):
                         self._enter(chunk, computed)
-                        count.advance(self._written())
-                        log.debug("%s", count.say())
+                        count.update(self._written())
                     self.flush()
-                    count.advance(self._written())
+                    count.update(self._written())
                     # batches never reach across a level that all points got to, so that an
                     # extended sweep runs the same ones however often it is resumed
                     self._about(finished=sorted({*self.record.about.get("finished", []), last}))
@@ -348,7 +346,7 @@ class _Run:
                         count.total -= (self.plan.trials - last) * self._drop_settled(last)
         finally:
             rows = {str(case): n for case, n in self.rows.items()}
-            session |= {"seconds": count.seconds, "trials": count.new, "chunk_rows": rows}
+            session |= {"seconds": time.perf_counter() - began, "trials": count.n - done, "chunk_rows": rows}
             self._about(
                 **identity_of_draws(self.plan.seed, self.plan.random),
                 sessions=[*self.record.about.get("sessions", []), session],

@@ -1,118 +1,468 @@
 """Every name that a config may use for stages and for parts of a world, such as scenes and motions.
 
-A package of the user adds a stage by an entry point of the group `torchsar.stages` (name =
-"package.module:Class"). A config has no other way to run code.
+A name is that of the class or function in snake case: `CorrectPulsePhase` is `correct_pulse_phase`.
+Stages are the public ones of the packages of stages, as far as a config can hold what they need,
+and the functions below that build further ones. A package of the user adds a stage by an
+entry point of the group `torchsar.stages` (name = "package.module:Class"). A config has no other
+way to run code.
 """
 
 from __future__ import annotations
 
+import inspect
+import typing
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, wraps
 from importlib.metadata import entry_points
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
+
+import torch
+from torch import Tensor
 
 from torchsar import compensate, echo, focus, multichannel, repair, scene
+from torchsar.compensate import Autofocus, EffectiveVelocity, RotationAutofocus, UnevenRotation
+from torchsar.compensate.pulse_phase import CorrectPulsePhase
+from torchsar.core import Alternate, Stage, Turn
+from torchsar.focus import OmegaK, PaddedLines, TargetImage
+from torchsar.io.plain import measured_displacement, read_array
+from torchsar.multichannel import (
+    AlongTrackAutofocus,
+    Detector,
+    ElementPattern,
+    Extraction,
+    FlatBand,
+    LeastSquares,
+    MigratingLines,
+    MinimumMeanSquare,
+    MovingPointVelocity,
+    Search,
+    SignalIntensityRatio,
+)
+from torchsar.multichannel.reconstruct import Rebuild
+from torchsar.multichannel.scene_image import MoversImage
+from torchsar.multichannel.velocity.aperture import ELEMENT_BEAM, Expected
+from torchsar.radar import LIGHT_M_S, BistaticRadar, FarField, InverseRadar, Spotlight, StripmapRadar, read_track
+from torchsar.scene import Dechirped, ImageReflectivity, KSea, MeasuredTrack, Polynomial, RecordedPath, Sinusoid
 from torchsar.scene.fluctuation import RandomMotion
-from torchsar.study.names import channels, factories
 from torchsar.study.settings.errors import loading
-from torchsar.study.settings.signature import Catalogue, Section
+from torchsar.study.settings.signature import Catalogue, Section, snake
+
+
+def effective_velocity(
+    radar: StripmapRadar,
+    reference: Literal["matched", "flat", "phase"] | None = "matched",
+    reach_m_s: float = 80.0,
+    lines: int = 512,
+    tolerance_m_s: float = 0.01,
+    assess: bool = True,
+) -> EffectiveVelocity:
+    """Estimator of the effective velocity, as the velocity that gives the least image entropy.
+
+    Args:
+        reference: Reference of the range compression; None if the lines are already compressed.
+        reach_m_s: Largest error of the nominal velocity in m/s.
+        lines: Number of range cells that are used, at least 16.
+        tolerance_m_s: Tolerance of the refinement in m/s.
+        assess: Whether to add the standard deviation and the outcome.
+    """
+    return EffectiveVelocity(OmegaK(radar, reference), reach_m_s, lines, tolerance_m_s=tolerance_m_s, assess=assess)
+
+
+def padded_lines(
+    radar: StripmapRadar,
+    reference: Literal["matched", "flat", "phase"] | None = "matched",
+    velocity_m_s: float | None = None,
+    doppler_hz: float | None = None,
+    lines: int | None = None,
+) -> PaddedLines:
+    """Omega-K focusing with empty lines appended to the record, so that apertures that are cut off
+    at its end do not appear at its beginning.
+
+    Args:
+        reference: Reference of the range compression; None if the lines are already compressed.
+        velocity_m_s: Velocity in m/s; None for that of the radar.
+        doppler_hz: Doppler centroid in Hz; None for that of the radar.
+        lines: Number of empty lines; None for one aperture.
+    """
+    return PaddedLines(OmegaK(radar, reference, velocity_m_s, doppler_hz), lines)
+
+
+def autofocus(
+    radar: InverseRadar,
+    geometry: FarField | Spotlight | None = None,
+    search: int = 120,
+    polish: int = 20,
+    scene: Literal["sparse", "points", "clutter", "auto"] = "sparse",
+    assess: bool = True,
+) -> Autofocus:
+    """Phase per pulse that sharpens the image of a target; see `torchsar.compensate.autofocus`.
+
+    The image is the polar-format image of `TargetImage` if `geometry` is given, and the Fourier
+    transform along pulses otherwise.
+
+    Args:
+        geometry: Geometry of the recording; None if it is not known.
+        search: Largest number of iterations of the entropy fixed point, approximately.
+        polish: Largest number of further iterations, which compare each pulse with a Wiener
+            estimate of the scene.
+        scene: Kind of the scene: "sparse", "points", "clutter" or "auto"; with a geometry it is
+            taken to be sparse.
+        assess: Whether to add the standard deviation and the outcome.
+    """
+    imaging = None if geometry is None else TargetImage(radar, geometry)
+    return Autofocus(search, polish, imaging, scene, assess)
+
+
+def rotation_and_phase(
+    radar: InverseRadar,
+    order: int = 3,
+    yc_m: float = 0.0,
+    rounds: int = 3,
+    scatterers: int | None = None,
+    search: int = 60,
+    polish: int = 20,
+    assess: bool = True,
+) -> Alternate:
+    """Alternate estimation of a phase error per pulse (`RotationAutofocus`) and of the non-uniform
+    rotation (`UnevenRotation`) of a target, each from the data after correction of the other.
+
+    Args:
+        order: Degree of the rotation angle as a polynomial of slow time.
+        yc_m: Range in metres from the centre of rotation to the zero of the range axis. It is not
+            estimated, because the phase errors of the pulses absorb its whole effect.
+        rounds: Number of rounds; each round estimates the phase and then the rotation.
+        scatterers: Largest number of scatterers by which the rotation is estimated.
+        search: Largest number of fixed-point iterations for the phase of least image entropy.
+        polish: Largest number of further iterations for the phase, which compare each pulse with a
+            Wiener estimate of the scene.
+        assess: Whether to add the standard deviations and the outcome.
+    """
+    return Alternate(
+        rounds,
+        phase=Turn(RotationAutofocus(radar, search, polish, assess=assess), CorrectPulsePhase()),
+        rotation=Turn(UnevenRotation(radar, order, yc_m, scatterers, assess=assess)),
+    )
+
+
+def vibration(name: str, unit: Literal["mm", "um"]) -> Sinusoid:
+    """Sinusoidal vibration by a name of the form amplitude_frequency_phase, such as `1_0.1_90`.
+
+    Args:
+        name: Amplitude in `unit`, frequency in hertz and phase in degrees.
+        unit: Unit of the amplitude, "mm" or "um".
+    """
+    return Sinusoid.named(name, unit=unit)
+
+
+def moving_point_velocity(
+    radar: BistaticRadar,
+    aperture: Expected = ELEMENT_BEAM,
+    search: Search | None = None,
+    u_a_m_s: float | None = None,
+    range_m: float | None = None,
+    assess: bool = True,
+) -> MigratingLines:
+    """Recommended estimator of velocity and position of a moving target. It needs no initial
+    values, only the limits of the search.
+
+    Args:
+        aperture: Illumination of the target.
+        search: Extent of the search; None for 1.5 times the ambiguous velocity of the radar in
+            slant-range speed.
+        u_a_m_s: Along-track speed in m/s if it is known a priori; None to estimate it.
+        range_m: Closest range of the target in m; None for that of the strongest range line, or for
+            the reference range of the radar if the data have no range axis.
+        assess: Whether the outcome is assessed.
+    """
+    estimator = MovingPointVelocity(radar, aperture, range_m, search, u_a_m_s, assess=assess)
+    return MigratingLines(radar, estimator, assess=assess)
+
+
+def alternate_velocity(
+    radar: BistaticRadar,
+    bandwidth_hz: float,
+    aperture: Expected = ELEMENT_BEAM,
+    rebuild: Rebuild | None = None,
+    rounds: int = 2,
+    step_m_s: float = 0.5,
+    half_m_s: float = 20.0,
+    assess: bool = True,
+) -> MigratingLines:
+    """Alternate estimation of the slant-range speed u_r of a target by the signal intensity ratio,
+    and of its along-track speed u_a by autofocus.
+
+    Args:
+        bandwidth_hz: Width of the processed Doppler band in Hz.
+        aperture: Illumination of the target.
+        rebuild: Reconstruction of the Doppler bands; None for least squares with three bands.
+        rounds: Number of rounds; each round estimates u_r and then u_a.
+        step_m_s: Step of the search for u_r in m/s.
+        half_m_s: Half width of the search interval of u_a about 0, in m/s.
+        assess: Whether the outcome is assessed.
+
+    Reference:
+        Remote Sens. 2020, 12, 1703, section 4.3.
+    """
+    ratio = SignalIntensityRatio(radar, bandwidth_hz, rebuild, None, step_m_s, assess=assess)
+    autofocus = AlongTrackAutofocus(radar, aperture, None, half_m_s, assess=assess)
+    made = Alternate(rounds, u_r=Turn(ratio), u_a=Turn(autofocus))
+    made.works_on, made.also_on = autofocus.works_on, autofocus.also_on
+    return MigratingLines(radar, made, one_line=True, assess=assess)
+
+
+def movers_image(
+    radar: BistaticRadar,
+    bands: int = 2,
+    method: Literal["least_squares", "mmse"] = "least_squares",
+    band_hz: float | None = None,
+    snr_db: float = 40.0,
+    removal: Literal["subtract", "zero"] = "subtract",
+    integration_s: float = 4.5,
+    segment_s: float = 0.6,
+    half_along_m: float = 120.0,
+    half_range_m: float = 60.0,
+    threshold_db: float = 10.0,
+    most: int = 8,
+    u_a_reach_m_s: float = 20.0,
+    suppressed_m_s: Sequence[float] = Detector().suppressed_m_s,
+    assess: bool = True,
+) -> MoversImage:
+    """Image of a scene with its moving targets focused at their true positions, and estimates of
+    their motion.
+
+    Args:
+        bands: Number of Doppler bands, each as wide as the PRF, that are separated.
+        method: Reconstruction of the bands: "least_squares", or "mmse" (minimum mean-square error),
+            which also works where the least-squares solution is singular.
+        band_hz: Width in Hz of the flat Doppler spectrum that "mmse" assumes; None for the spectrum
+            that the antenna pattern of the channels gives.
+        snr_db: Signal-to-noise ratio that "mmse" assumes, in dB.
+        removal: "subtract" removes the echo fitted to a target; "zero" removes all data in the area
+            of the target, including the sea.
+        integration_s: Time in s for which a scatterer is illuminated.
+        segment_s: Length in s of the segments of slow time in which the sea about a target is
+            suppressed.
+        half_along_m: Half width of a target along track in m.
+        half_range_m: Half width of a target in range in m.
+        threshold_db: Least contrast of a target in dB: the mean intensity of a small rectangle of
+            pixels over the median of all such means.
+        most: Largest number of targets.
+        u_a_reach_m_s: Half width of the search in the along-track speed in m/s.
+        suppressed_m_s: Slant-range speeds in m/s for a further image in which the sea is
+            suppressed, so that weaker targets are detected; empty to omit this image.
+        assess: Whether the outcome is assessed.
+
+    Reference:
+        Remote Sens. 2020, 12, 1703, Fig. 13.
+    """
+    extraction = Extraction(half_along_m, half_range_m, integration_s, segment_s)
+    detector = Detector(threshold_db, most=most, suppressed_m_s=suppressed_m_s)
+    prior = ElementPattern() if band_hz is None else FlatBand(band_hz)
+    rebuild = LeastSquares(bands) if method == "least_squares" else MinimumMeanSquare(bands, snr_db, prior)
+    return MoversImage(radar, rebuild, removal, extraction, detector, u_a_reach_m_s, assess=assess)
+
+
+def drift(velocity_m_s: Tensor | float = 0.0, acceleration_m_s2: Tensor | float = 0.0) -> Polynomial:
+    """Constant velocity and acceleration along the line of sight, d = v t + a t^2 / 2.
+
+    Args:
+        velocity_m_s: Velocity in m/s, receding positive.
+        acceleration_m_s2: Acceleration in m/s^2.
+    """
+    return Polynomial((velocity_m_s, acceleration_m_s2 / 2))
+
+
+def dechirped(track_m: Sequence[Tensor | float] | None = None) -> Dechirped:
+    """Echo model of dechirped pulses, with the range of a target computed at every sample.
+
+    Args:
+        track_m: Polynomial that the range window follows: velocity in m/s, half the acceleration in
+            m/s^2, and so on; None for a fixed range window.
+    """
+    return Dechirped((Polynomial(track_m),) if track_m else ())
+
+
+def k_sea(
+    cnr_db: Tensor | float = 30.0,
+    shape: Tensor | float = 1.5,
+    cell_m: tuple[float, float] = (20.0, 20.0),
+    margin_s: float | None = None,
+    lobes: int = 1,
+) -> KSea:
+    """K-distributed sea clutter.
+
+    Args:
+        cnr_db: Clutter-to-noise ratio of a range-compressed sample in dB.
+        shape: Shape of the gamma distribution; small for spiky seas.
+        cell_m: Along-track and range side of the cells of constant texture in metres.
+        margin_s: Time in s by which the surface extends beyond the record at both ends; None to
+            reach to the edge of the illumination.
+        lobes: Number of nulls of the antenna pattern, to either side of its maximum, up to which
+            the antenna illuminates the surface.
+    """
+    return KSea(power_db=cnr_db, shape=shape, cell_m=cell_m, margin_s=margin_s, lobes=lobes)
+
+
+def measured_track(file: str) -> MeasuredTrack:
+    """Measured displacement at equally spaced times, interpolated by a cubic spline.
+
+    Args:
+        file: Text or .csv file of two columns, times in seconds and displacements in metres
+            (separated by commas or blanks, a line of names is allowed), .npy file of shape (n, 2),
+            or .npz file with `time_s` (n,) and `displacement_m` (..., n).
+    """
+    time_s, displacement_m = (torch.as_tensor(x, dtype=torch.float64) for x in measured_displacement(file))
+    try:
+        return MeasuredTrack(time_s, displacement_m)
+    except ValueError as problem:
+        raise ValueError(f"{file}: {problem}") from None
+
+
+def recorded_path(file: str, origin: Sequence[float] | None = None, start_s: float | None = None) -> RecordedPath:
+    """Path of a motion log, between whose records cubic splines interpolate.
+
+    Args:
+        file: Table (.csv, text, .npz) with the columns time, x, y, z in s and m, or time, latitude,
+            longitude, height in s, degrees and m, see `torchsar.radar.read_track`.
+        origin: Origin of the coordinates of the world: x, y, z, or latitude, longitude, height;
+            null for that of the log, or the place of its first record at height 0.
+        start_s: Time of the first pulse on the clock of the log; null for the first record.
+    """
+    try:
+        return RecordedPath(read_track(file, origin), start_s)
+    except OSError as error:
+        raise ValueError(str(error)) from None
+
+
+def image_sea(
+    file: str,
+    azimuth_extent_m: Tensor | float,
+    range_extent_m: Tensor | float,
+    cnr_db: Tensor | float = 30.0,
+    key: str | None = None,
+    margin_s: float | None = None,
+    lobes: int = 1,
+) -> ImageReflectivity:
+    """Surface whose mean intensity is the image in a .npy or .npz file.
+
+    Args:
+        file: Path of the file.
+        azimuth_extent_m: Along-track extent of the image in metres.
+        range_extent_m: Range extent of the image in metres.
+        cnr_db: Clutter-to-noise ratio of a range-compressed sample in dB.
+        key: Name of the array in an .npz file of several arrays.
+        margin_s: Time in s by which the surface extends beyond the record at both ends; None to
+            reach to the edge of the illumination.
+        lobes: Number of nulls of the antenna pattern, to either side of its maximum, up to which
+            the antenna illuminates the surface.
+    """
+    try:
+        keys = {"power_db": cnr_db, "margin_s": margin_s, "lobes": lobes}
+        return ImageReflectivity(read_array(file, key), azimuth_extent_m, range_extent_m, **keys)
+    except OSError as error:
+        raise ValueError(f"the image {file!r} cannot be read: {error.strerror or error}") from None
+
+
+def with_wavelength(radar: type) -> Callable[..., Any]:
+    """Return the constructor of a radar with `wavelength_m` as an alternative to `carrier_hz`.
+
+    Args:
+        radar: Class of the radar, with the parameter `carrier_hz`.
+
+    Returns:
+        A function with the signature of the class and the parameter `wavelength_m`.
+    """
+
+    @wraps(radar, updated=())
+    def made(carrier_hz: float | None = None, wavelength_m: float | None = None, **keys: Any) -> Any:
+        if (carrier_hz is None) == (wavelength_m is None):
+            raise ValueError("give one of carrier_hz and wavelength_m, and leave the other null")
+        speed = keys.get("wave_speed_m_s", LIGHT_M_S)
+        return radar(carrier_hz=carrier_hz if wavelength_m is None else speed / wavelength_m, **keys)
+
+    signature, optional = inspect.signature(radar), inspect.Parameter.KEYWORD_ONLY
+    rest = [p.replace(kind=optional) for p in signature.parameters.values() if p.name != "carrier_hz"]
+    first = [inspect.Parameter(name, optional, default=None) for name in ("carrier_hz", "wavelength_m")]
+    made.__signature__, made.__doc__ = (  # pyright: ignore[reportAttributeAccessIssue]
+        signature.replace(parameters=[*first, *rest]),
+        inspect.cleandoc(radar.__doc__ or "").replace(
+            "carrier_hz:", "wavelength_m: Wavelength in metres, in place of `carrier_hz`.\n    carrier_hz:", 1
+        ),
+    )
+    hints = typing.get_type_hints(radar.__init__)
+    made.__annotations__ = {**hints, "carrier_hz": float | None, "wavelength_m": float | None}
+    return made
+
 
 SCENES = Catalogue(
     "scene",
     "kind",
-    {
-        "points": scene.Points,
-        "random_points": scene.RandomPoints,
-        "speckle": scene.Speckle,
-        "aircraft": scene.Aircraft,
-        "satellite": scene.Satellite,
-        "spread_rows": scene.SpreadRows,
-        "letter_e": scene.LetterE,
-        "retro_and_broken_line": scene.RetroAndBrokenLine,
-    },
+    (
+        scene.Points,
+        scene.RandomPoints,
+        scene.Speckle,
+        scene.Aircraft,
+        scene.Satellite,
+        scene.SpreadRows,
+        scene.LetterE,
+        scene.RetroAndBrokenLine,
+    ),
 )
-BEAMS = Catalogue("beam", "kind", {"always_lit": scene.AlwaysLit, "dwell": scene.Dwell, "antenna": scene.Antenna})
-PATHS = Catalogue("path", "kind", {"hyperbola": scene.Hyperbola, "parabola": scene.Parabola})
-MOTIONS = Catalogue(
-    "motion", "kind", {"vibration": scene.Sinusoid.named, "sinusoid": scene.Sinusoid, "polynomial": scene.Polynomial}
-)
+BEAMS = Catalogue("beam", "kind", (scene.AlwaysLit, scene.Dwell, scene.Antenna))
+PATHS = Catalogue("path", "kind", (scene.Hyperbola, scene.Parabola))
+MOTIONS = Catalogue("motion", "kind", (vibration, scene.Sinusoid, scene.Polynomial))
 RADIAL_MOTIONS = Catalogue(
     "motion of the line of sight",
     "kind",
-    {
-        **MOTIONS.entries,
-        "drift": factories.drift,
-        "path_fluctuation": scene.PathFluctuation,
-        "vibration_spectrum": scene.VibrationSpectrum,
-        "measured_track": factories.measured_track,
-    },
+    (
+        *MOTIONS.entries.values(),
+        drift,
+        scene.PathFluctuation,
+        scene.VibrationSpectrum,
+        measured_track,
+    ),
 )
 FLIGHT_MOTIONS = Catalogue(
     "motion of an antenna",
     "kind",
-    {**RADIAL_MOTIONS.entries, "offset": scene.Offset, "jitter": scene.Jitter, "random_walk": scene.RandomWalk},
+    (*RADIAL_MOTIONS.entries.values(), scene.Offset, scene.Jitter, scene.RandomWalk),
 )
-NOMINAL_PATHS = Catalogue(
-    "nominal path",
-    "kind",
-    {"straight": scene.StraightPath, "circular": scene.CircularPath, "recorded": factories.recorded_path},
-)
-GROUNDS = Catalogue("ground", "kind", {"plane": scene.PlaneGround})
-START_PHASES = Catalogue("start phase", "kind", {"normal": scene.StartPhase, "uniform": scene.UniformStartPhase})
-FIDELITIES = Catalogue("fidelity", "kind", {"phase_only": scene.PhaseOnly, "dechirped": factories.dechirped})
+NOMINAL_PATHS = Catalogue("nominal path", "kind", (scene.StraightPath, scene.CircularPath, recorded_path))
+GROUNDS = Catalogue("ground", "kind", (scene.PlaneGround,))
+START_PHASES = Catalogue("start phase", "kind", (scene.StartPhase, scene.UniformStartPhase))
+FIDELITIES = Catalogue("fidelity", "kind", (scene.PhaseOnly, dechirped))
 SWEEP_FIDELITIES = Catalogue(
     "fidelity of a sweep",
     "kind",
-    {
-        "linear_in_sweep": scene.LinearInSweep,
-        "quadratic_in_sweep": scene.QuadraticInSweep,
-        "every_sample": scene.EverySample,
-        "one_per_sweep": scene.OnePerSweep,
-        "one_per_period": scene.OnePerPeriod,
-    },
+    (scene.LinearInSweep, scene.QuadraticInSweep, scene.EverySample, scene.OnePerSweep, scene.OnePerPeriod),
 )
-LOG_AMPLITUDES = Catalogue("log-amplitude", "kind", {"scintillation": scene.LogAmplitude})
-SWEEP_ERRORS = Catalogue(
-    "sweep error", "kind", {"polynomial": echo.PolynomialSweepError, "sinusoid": echo.SinusoidSweepError}
-)
-CALIBRATIONS = Catalogue("calibration", "kind", {"fibre": scene.CalibrationFibre})
-GATES = Catalogue("gate", "kind", {"band_limited": scene.BandLimited, "pattern": scene.Pattern})
-SEAS = Catalogue("sea", "kind", {"k_sea": factories.k_sea, "image": factories.image_sea})
-RECEIVE_RANGES = Catalogue("receive range", "kind", {"exact": scene.ExactRange, "taylor": scene.TaylorRange})
+LOG_AMPLITUDES = Catalogue("log-amplitude", "kind", (scene.LogAmplitude,))
+SWEEP_ERRORS = Catalogue("sweep error", "kind", (echo.PolynomialSweepError, echo.SinusoidSweepError))
+CALIBRATIONS = Catalogue("calibration", "kind", (scene.CalibrationFibre,))
+GATES = Catalogue("gate", "kind", (scene.BandLimited, scene.Pattern))
+SEAS = Catalogue("sea", "kind", (k_sea, image_sea))
+RECEIVE_RANGES = Catalogue("receive range", "kind", (scene.ExactRange, scene.TaylorRange))
 MULTICHANNEL_IMPAIRMENTS = Catalogue(
-    "impairment of a multichannel recording",
-    "kind",
-    {"channel_errors": echo.ChannelErrors, "clock_errors": echo.SynchronisationError},
+    "impairment of a multichannel recording", "kind", (echo.ChannelErrors, echo.SynchronisationError)
 )
+_OF_TARGETS = (echo.LostPulses, echo.WhitePhase, echo.PhaseWalk, echo.PhaseSinusoid, echo.Quantiser)
 IMPAIRMENTS = Catalogue(
     "impairment",
     "kind",
-    {
-        "channel_imbalance": echo.ChannelImbalance,
-        "channel_response": echo.smooth_response,
-        "tone": echo.Tone,
-        "wide_interferer": echo.WideInterferer,
-        "quantiser": echo.Quantiser,
-        "periodic_jitter": echo.PeriodicJitter,
-        "lost_lines": echo.LostLines,
-        "lost_gaps": echo.LostGaps,
-        "repeated_lines": echo.RepeatedLines,
-        "corrupted_numbers": echo.CorruptedNumbers,
-        "lost_pulses": echo.LostPulses,
-        "white_phase": echo.WhitePhase,
-        "phase_walk": echo.PhaseWalk,
-        "phase_sinusoid": echo.PhaseSinusoid,
-    },
+    (
+        echo.ChannelImbalance,
+        echo.smooth_response,
+        echo.Tone,
+        echo.WideInterferer,
+        echo.PeriodicJitter,
+        echo.LostLines,
+        echo.LostGaps,
+        echo.RepeatedLines,
+        echo.CorruptedNumbers,
+        *_OF_TARGETS,
+    ),
 )
-
-TARGET_IMPAIRMENTS = Catalogue(
-    "impairment of range profiles of a target",
-    "kind",
-    {
-        name: IMPAIRMENTS.entries[name]
-        for name in ("lost_pulses", "white_phase", "phase_walk", "phase_sinusoid", "quantiser")
-    },
-)
+TARGET_IMPAIRMENTS = Catalogue("impairment of range profiles of a target", "kind", _OF_TARGETS)
 AntennaMotions = Sequence[Annotated[scene.Motion | RandomMotion, FLIGHT_MOTIONS]]
 
 
@@ -127,12 +477,8 @@ def path_error(x: AntennaMotions = (), y: AntennaMotions = (), z: AntennaMotions
     return echo.PathError(scene.Sway(x, y, z))
 
 
-PATH_IMPAIRMENTS = Catalogue(
-    "impairment of a recording along any path", "kind", {**TARGET_IMPAIRMENTS.entries, "path_error": path_error}
-)
-LADAR_IMPAIRMENTS = Catalogue(
-    "impairment of a ladar recording", "kind", {"quantiser": IMPAIRMENTS.entries["quantiser"]}
-)
+PATH_IMPAIRMENTS = Catalogue("impairment of a recording along any path", "kind", (*_OF_TARGETS, path_error))
+LADAR_IMPAIRMENTS = Catalogue("impairment of a ladar recording", "kind", (echo.Quantiser,))
 # what `torchsar list` shows besides stages, by the section of the world that names it
 WORLD = {
     "SCENES (world.scene)": SCENES,
@@ -159,120 +505,39 @@ WORLD = {
     "IMPAIRMENTS (geo)": MULTICHANNEL_IMPAIRMENTS,
 }
 
-REPAIR: dict[str, Callable[..., Any]] = {
-    "line_integrity": repair.LineIntegrity,
-    "zero_fill": repair.ZeroFill,
-    "linear_fill": repair.LinearFill,
-    "band_limited_fill": repair.BandLimitedFill,
-    "sparse_fill": repair.SparseFill,
-    "interference_subtract": repair.SubtractInterference,
-    "interference_notch": repair.NotchInterference,
-    "interference_drop": repair.DropInterference,
-    "jitter_pilot": repair.PilotJitter,
-    "jitter_blind": repair.BlindJitter,
-    "jitter_lagrange": factories.jitter_lagrange,
-    "jitter_band_limited": factories.jitter_band_limited,
-    "jitter_exact": repair.CorrectJitter,
-    "imbalance": repair.EstimateImbalance,
-    "imbalance_correct": repair.CorrectImbalance,
-    "response": repair.EstimateResponse,
-    "response_flat_band": repair.EstimateFlatResponse,
-    "response_correct": repair.CorrectResponse,
-    "split_sweeps": repair.SplitSweeps,
-    "circular_shift": repair.CircularShift,
-    "blank_turning_points": repair.BlankTurningPoints,
-    "calibrate_sweeps": repair.CalibrateSweeps,
-    "channel_balance": channels.channel_balance,
-    "channel_balance_correct": multichannel.CorrectBalance,
-    "synchronisation": multichannel.EstimateSynchronisation,
-    "synchronisation_remove": multichannel.RemoveSynchronisation,
-}
-COMPENSATE: dict[str, Callable[..., Any]] = {
-    "phase_increment": compensate.PhaseIncrement,
-    "energy_centre": compensate.EnergyCentre,
-    "doppler_centroid": compensate.DopplerCentroid,
-    "point_doppler": compensate.PointDoppler,
-    "effective_velocity": factories.effective_velocity,
-    "align_envelopes": compensate.AlignEnvelopes,
-    "shift_range": compensate.ShiftRange,
-    "sca": compensate.Sca,
-    "pga": compensate.Pga,
-    "pga_sca": compensate.PgaSca,
-    "entropy_fixed_point": compensate.EntropyFixedPoint,
-    "sharpest_phase": compensate.SharpestPhase,
-    "link_phases": compensate.LinkPhases,
-    "autofocus": factories.autofocus,
-    "path_autofocus": compensate.PathAutofocus,
-    "path_phase": compensate.PathPhase,
-    "strip_autofocus": compensate.StripAutofocus,
-    "path_correct": compensate.CorrectPath,
-    "pulse_phase_correct": compensate.CorrectPulsePhase,
-    "segmented_interference": compensate.SegmentedInterference,
-    "mirror_product": compensate.MirrorProduct,
-    "radial_motion": compensate.RadialMotion,
-    "ml_peak": compensate.MlPeak,
-    "spectrum_correlation": compensate.SpectrumCorrelation,
-    "compensate_motion": compensate.CompensateMotion,
-    "phase_polish": compensate.PhasePolish,
-    "pulse_gain": compensate.PulseGain,
-    "equalise_pulses": compensate.EqualisePulses,
-    "rotation": compensate.UnevenRotation,
-    "rotation_coarse": compensate.CoarseRotation,
-    "rotation_entropy": compensate.EntropyRotation,
-    "rotation_autofocus": compensate.RotationAutofocus,
-    "rotation_and_phase": factories.rotation_and_phase,
-    "transmit_range_remove": multichannel.RemoveTransmitRange,
-    "azimuth_scaling": multichannel.AzimuthScaling,
-    "walk_ambiguity": multichannel.WalkAmbiguity,
-    "migration_correct": channels.migration_correct,
-    "moving_point_velocity": channels.moving_point_velocity,
-    "interferometry": channels.interferometry,
-    "along_track_autofocus": channels.along_track_autofocus,
-    "likelihood_velocity": channels.likelihood_velocity,
-    "gradient_velocity": channels.gradient_velocity,
-    "intensity_ratio": channels.intensity_ratio,
-    "alternate_velocity": channels.alternate_velocity,
-}
-FOCUS: dict[str, Callable[..., Any]] = {
-    "range_compress": focus.RangeCompress,
-    "omega_k": focus.OmegaK,
-    "omega_k_padded": factories.omega_k_padded,
-    "omega_k_stolt": focus.OmegaKStolt,
-    "range_doppler": focus.RangeDoppler,
-    "backproject": focus.Backproject,
-    "closest_range": focus.ClosestRange,
-    "tile_image": focus.TileImage,
-    "direct_image": focus.DirectImage,
-    "omega_k_image": focus.OmegaKImage,
-    "spotlight_image": focus.SpotlightImage,
-    "compress_dechirped": focus.CompressDechirped,
-    "azimuth_transform": focus.AzimuthTransform,
-    "target_image": focus.TargetImage,
-    "compress_sweeps": focus.CompressSweeps,
-    "deramp_azimuth": focus.DerampAzimuth,
-    "azimuth_matched_filter": focus.AzimuthMatchedFilter,
-    "range_phase": focus.RangePhase,
-    "matched_fourier": focus.MatchedFourier,
-    "focus_strip": focus.FocusStrip,
-    "detect": focus.Detect,
-    "quick_look": focus.QuickLook,
-    "chirplet_clean": compensate.ChirpletClean,
-    "compress_channels": multichannel.CompressChannels,
-    "rebuild_bands": channels.rebuild_bands,
-    "stationary_image": channels.stationary_image,
-    "movers_image": channels.movers_image,
-    "focus_target": multichannel.FocusAzimuth,
+# the bases of other stages, and what gives no signal
+_NO_STAGES = ("path_image", "image_movers")
+# stages that a function builds from plain keys, by the package where they are listed
+_BUILT = {
+    "repair": (),
+    "compensate": (autofocus, effective_velocity, rotation_and_phase),
+    "multichannel": (moving_point_velocity, alternate_velocity, movers_image),
+    "focus": (padded_lines,),
 }
 # keys of stages that choose a form, and that may be left to choose
 _AUTOMATIC = (
-    "migration_correct.kind",
-    "transmit_range_remove.order",
+    "correct_migration.migration",
+    "remove_transmit_range.order",
     "stationary_image.form",
-    "rotation.order",
+    "uneven_rotation.order",
     "matched_fourier.transform",
 )
 _GIVEN = ("radar", "geometry", "side_data", "expected_power")
-GROUPS = {"repair": REPAIR, "compensate": COMPENSATE, "focus": FOCUS}
+
+
+def _public(package: Any) -> dict[str, Callable[..., Any]]:
+    """The public stages of a package, by name."""
+    classes = (getattr(package, name) for name in package.__all__)
+    found = {snake(one.__name__): one for one in classes if isinstance(one, type) and issubclass(one, Stage)}
+    return {name: one for name, one in found.items() if name not in _NO_STAGES and Section(one, _GIVEN).is_complete}
+
+
+GROUPS: dict[str, dict[str, Callable[..., Any]]] = {
+    package.__name__.removeprefix("torchsar."): _public(package)
+    for package in (repair, compensate, multichannel, focus)
+}
+for _group, _made in _BUILT.items():
+    GROUPS[_group] |= {one.__name__: one for one in _made}
 
 
 @cache
@@ -293,5 +558,5 @@ def stages() -> Catalogue:
 
 
 def group_of(name: str) -> str:
-    """Return the group of a stage: repair, compensate, focus, or `own` for a stage of the user."""
+    """Return the package of a stage, such as repair or focus, or `own` for a stage of the user."""
     return next((group for group, members in GROUPS.items() if name in members), "own")

@@ -1,14 +1,17 @@
 """Result folders, each with one result and possibly other files of the user.
 
 A result folder has a directory `.torchsar` with a lock, the manifest of the files that the program
-wrote, and, while a command runs, its incomplete result. The program replaces and removes only files
-of the manifest that were not changed since. A complete result is moved to its final path; if the
-move is interrupted or fails, the next command completes it according to a journal.
+wrote, and, while a command runs, its incomplete result in the directory `new`. The program replaces
+and removes only files of the manifest that were not changed since. A complete result is entered in
+the manifest beside the earlier one, and its files are then moved; if that is interrupted or fails,
+the next command completes it.
 """
 
 from __future__ import annotations
 
+import hashlib
 import itertools
+import json
 import logging
 import os
 import shutil
@@ -18,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torchsar.study.output.own_files import OwnFiles, remove_empty
+from torchsar.io.seal import is_sealed, sealed
 from torchsar.study.settings.errors import ConfigError
 
 try:
@@ -44,11 +47,6 @@ class ResultFolder:
     path: Path
     kind: str
 
-    @property
-    def files(self) -> OwnFiles:
-        """The files that the program wrote."""
-        return OwnFiles(self.path, self.path / STATE, _LAST)
-
     @contextmanager
     def staged(self) -> Iterator[Path]:
         """Provide an empty folder for a new result.
@@ -61,23 +59,35 @@ class ResultFolder:
             ConfigError: If the result cannot replace the earlier one, for example because a file of
                 the user has the path of one of its files; the message says where it is.
         """
-        new = self.files.new
+        new = self.path / STATE / "new"
         new.mkdir()
         try:
             yield new
         except BaseException:
             shutil.rmtree(new, ignore_errors=True)
             raise
-        self._publish(new)
+        try:
+            self.refuse_conflicts(sorted(path.name for path in new.iterdir()))
+            files = {path.relative_to(new).as_posix(): _print_of(path) for path in _files(new)}
+            self._note(kind=self.kind, files=files, old=self._manifest()["files"])
+            self.finish()
+        except (ConfigError, OSError) as error:
+            why = getattr(error, "strerror", None)
+            text = f"--out {self.path}: the result could not be moved to its place ({why})" if why else str(error)
+            if self._manifest()["old"] is not None:
+                raise ConfigError(f"{text}; the next command with this folder completes the move") from error
+            places = (self.path / f"kept-{i}" for i in itertools.count(1))
+            kept = new.rename(next(path for path in places if not os.path.lexists(path)))
+            raise ConfigError(f"{text}; this result was kept in {kept}") from error
 
     @property
     def claimed(self) -> bool:
         """Whether the folder is reserved for, or holds, a result of this kind."""
-        return self.files.manifest()["kind"] == self.kind
+        return self._manifest()["kind"] == self.kind
 
     def claim(self) -> None:
         """Reserve the folder for a result of this kind."""
-        self.files.claim(self.kind)
+        self._note(kind=self.kind)
 
     def refuse_conflicts(self, names: Sequence[str]) -> None:
         """Check that no file of the user has the name of a file of the result.
@@ -88,38 +98,62 @@ class ResultFolder:
         Raises:
             ConfigError: If there is such a file, or the result of another command.
         """
-        kind = self.files.manifest()["kind"]
-        if kind not in (None, self.kind):
-            raise ConfigError(f"--out {self.path} holds the result of another command, {kind}; choose another folder")
-        name = self.files.foreign(names)
-        if name:
+        held = self._manifest()
+        if held["kind"] not in (None, self.kind):
             raise ConfigError(
-                f"--out {self.path}: torchsar did not write {name}, or it was changed since; move it, or choose "
-                "another folder"
+                f"--out {self.path} holds the result of another command, {held['kind']}; choose another folder"
             )
+        for path in (path for name in names for path in _files(self.path / name)):
+            name = path.relative_to(self.path).as_posix()
+            if _print_of(path) != held["files"].get(name, ()):
+                raise ConfigError(
+                    f"--out {self.path}: torchsar did not write {name}, or it was changed since; move it, or choose "
+                    "another folder"
+                )
 
     def finish(self) -> None:
-        """Complete an interrupted replacement."""
-        for name in self.files.finish():
-            _say_kept(self.path, name)
+        """Complete a replacement that was interrupted, and remove files of incomplete results."""
+        held, new = self._manifest(), self.path / STATE / "new"
+        if held["old"] is not None:
+            files, old = held["files"], held["old"]
+            for name in sorted(old, key=_rank, reverse=True):
+                moved = name in files and not (new / name).exists()
+                if not moved and _print_of(self.path / name) == old[name]:
+                    (self.path / name).unlink()
+            above = [folder for name in old for folder in (self.path / name).parents]
+            _remove_empty([folder for folder in above if self.path in folder.parents])
+            for name in sorted(files, key=_rank):
+                if (new / name).is_file() and not _moved(new / name, self.path / name):
+                    text = "warning: %s: %s is a file of the user and was kept; the new one was removed"
+                    log.warning(text, self.path, name)
+            self._note(old=None)
+        shutil.rmtree(new, ignore_errors=True)
 
-    def _publish(self, new: Path) -> None:
+    def _manifest(self) -> dict[str, Any]:
+        """`kind` of the result, `files`, which is the print of each file by path, and `old`, which
+        is that of an earlier result while it is replaced, or None.
+        """
+        path = self.path / STATE / "manifest.json"
+        if path.exists() and not path.is_file():
+            raise ConfigError(f"{path} is no file; choose another folder, or remove it")
         try:
-            self.refuse_conflicts(sorted(path.name for path in new.iterdir()))
-            for name in self.files.replace(self.kind):
-                _say_kept(self.path, name)
-        except (ValueError, OSError) as error:
-            why = getattr(error, "strerror", None)
-            text = f"--out {self.path}: the result could not be moved to its place ({why})" if why else str(error)
-            if self.files.pending:
-                raise ConfigError(f"{text}; the next command with this folder completes the move") from error
-            places = (self.path / f"kept-{i}" for i in itertools.count(1))
-            kept = new.rename(next(path for path in places if not os.path.lexists(path)))
-            raise ConfigError(f"{text}; this result was kept in {kept}") from error
+            tree = json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return {"kind": None, "files": {}, "old": None}
+        except (OSError, ValueError, RecursionError) as error:
+            raise ConfigError(f"{path} cannot be read ({error}); choose another folder, or remove it") from None
+        if not isinstance(tree, dict) or not is_sealed(tree):
+            raise ConfigError(
+                f"{path} is damaged, since it differs from its checksum; choose another folder, or remove it"
+            )
+        return tree
 
-
-def _say_kept(out: Path, name: str) -> None:
-    log.warning("warning: %s: %s is a file of the user and was kept; the new one was removed", out, name)
+    def _note(self, **changes: Any) -> None:
+        """Replace entries of the manifest; the file changes as a whole."""
+        path = self.path / STATE / "manifest.json"
+        part = path.with_name("manifest.json.part")
+        part.write_text(json.dumps(sealed({**self._manifest(), **changes})), encoding="utf-8")
+        part.replace(path)
 
 
 @contextmanager
@@ -142,14 +176,14 @@ def opened(out: Path, kind: str, names: Sequence[str] = ()) -> Iterator[ResultFo
     with _locked(out):
         try:
             folder = ResultFolder(out, kind)
-            try:
-                folder.finish()
-                folder.refuse_conflicts(names)
-            except ValueError as error:  # a manifest or a journal that is damaged
-                raise ConfigError(str(error)) from None
+            folder.finish()
+            folder.refuse_conflicts(names)
             yield folder
         finally:
-            _tidy(out, made)
+            state = out / STATE
+            if {path.name for path in state.iterdir()} <= {"lock"}:
+                shutil.rmtree(state, ignore_errors=True)
+                _remove_empty(made)
 
 
 @contextmanager
@@ -198,9 +232,41 @@ def _locked(out: Path) -> Any:
         file.close()
 
 
-def _tidy(out: Path, made: Sequence[Path]) -> None:
-    """Remove a state directory with only the lock, and then those of `made` that are empty."""
-    state = out / STATE
-    if {path.name for path in state.iterdir()} <= {"lock"}:
-        shutil.rmtree(state, ignore_errors=True)
-        remove_empty(made)
+def _rank(name: str) -> tuple[int, str]:
+    return len(_LAST) - _LAST.index(name) if name in _LAST else 0, name
+
+
+def _files(path: Path) -> list[Path]:
+    """The file itself, or all files below a folder; a symbolic link or a pipe counts as a file."""
+    if path.is_symlink() or (path.exists() and not path.is_dir()):
+        return [path]
+    return sorted(p for p in path.rglob("*") if p.is_symlink() or not p.is_dir())
+
+
+def _print_of(path: Path) -> list[Any] | None:
+    """Size of a file and a digest of its content, without it above 4 MiB, whose reading would take
+    as long as a run; None for what is no file.
+    """
+    if path.is_symlink() or not path.is_file():
+        return None
+    size = path.stat().st_size
+    return [size, hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest() if size <= 1 << 22 else None]
+
+
+def _moved(source: Path, target: Path) -> bool:
+    """Move a file to a free path; return False if the path is not free."""
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if os.path.lexists(target):
+            return False
+        source.rename(target)
+    except (FileExistsError, NotADirectoryError):
+        return False
+    return True
+
+
+def _remove_empty(folders: Sequence[Path]) -> None:
+    """Remove those folders that are empty, the innermost ones first."""
+    for folder in sorted(set(folders), key=lambda path: -len(path.parts)):
+        if folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()

@@ -1,10 +1,14 @@
-"""Formatting of numbers: units with prefixes, and significant digits."""
+"""Numbers as text, with prefixes of units and significant digits, and in JSON files."""
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
+
+from torch import Tensor
 
 MISSING = "–"
 # units that have prefixes, unlike those of levels, ratios and angles in degrees
@@ -83,3 +87,18 @@ def _numbers(value: Any) -> list[float]:
     if isinstance(value, (list, tuple)):
         return [x for one in value for x in _numbers(one)]
     return [value] if isinstance(value, (int, float)) and not isinstance(value, bool) else []
+
+
+def write_json(path: Path, tree: Mapping[str, Any]) -> None:
+    """Write a JSON file. Numbers that are not finite become null, as the format requires."""
+    path.write_text(json.dumps(_finite(tree), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _finite(x: Any) -> Any:
+    if isinstance(x, Mapping):
+        return {str(k): _finite(v) for k, v in x.items()}
+    if isinstance(x, (list, tuple)):
+        return [_finite(v) for v in x]
+    if isinstance(x, Tensor):
+        return _finite(x.tolist())
+    return None if isinstance(x, float) and not math.isfinite(x) else x

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -11,8 +11,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from torchsar.core import Source
 from torchsar.study.settings.errors import ConfigError, did_you_mean
-from torchsar.study.settings.plausible import refuse_implausible
-from torchsar.study.settings.sentences import Strict, sentence
+from torchsar.study.settings.signature import Strict, sentence
 from torchsar.study.settings.text import dump, fault_of_name
 
 # prefix of the true values in configs of earlier versions
@@ -273,7 +272,7 @@ def checked(tree: Any, system: Any, file: str) -> Config:
     _check_source(config, system, file)
     sections = {name: getattr(config, name) for name in system.sections}
     made = {n: None if tree is None else system.sections[n].check(tree, n, file) for n, tree in sections.items()}
-    refuse_implausible(config.system, made["radar"], made["world"], file)
+    refuse_implausible(system.magnitudes, made["radar"], made["world"], file)
     found = config.data.impairments
     kept = {n: system.impairments.check(entry, f"data.impairments.{n}", file) for n, entry in found.items()}
     methods = {name: _method(method, f"processor.{name}", system, file) for name, method in config.processor.items()}
@@ -343,3 +342,151 @@ def _check_reruns(methods: Mapping[str, Method], file: str) -> None:
                     f"{method.rerun.method!r}{did_you_mean(start, of.stages)}"
                 )
         earlier[name] = method
+
+
+Magnitudes = Mapping[str, tuple[str, float, float]]
+# unit, least and largest magnitude of numbers other than zero, by the ending of their key; the
+# first ending that fits counts
+MAGNITUDES: Magnitudes = {
+    "wave_speed_m_s": ("m/s", 1e8, 3.1e8),
+    "carrier_hz": ("Hz", 2e7, 1e16),
+    "wavelength_m": ("m", 3e-8, 15.0),
+    "bandwidth_hz": ("Hz", 1e4, 1e13),
+    "sampling_hz": ("Hz", 1e4, 1e13),
+    "prf_hz": ("Hz", 1.0, 1e8),
+    "period_s": ("s", 1e-8, 1e-2),
+    "pulse_s": ("s", 1e-10, 1e-1),
+    "pulse.duration_s": ("s", 1e-10, 1e-1),
+    "reference_range_m": ("m", 10.0, 1e9),
+    "near_range_m": ("m", 1.0, 1e8),
+    "element_m": ("m", 1e-4, 1e2),
+    "_hz_s": ("Hz/s", 0.0, 1e18),
+    "_rad_s": ("rad/s", 0.0, 1e3),
+    "_m_s2": ("m/s^2", 0.0, 1e6),
+    "_m_s": ("m/s", 0.0, 3e4),
+    "_hz": ("Hz", 0.0, 1e13),
+    "_rad": ("rad", 0.0, 1e4),
+    "_deg": ("degrees", 0.0, 720.0),
+    "_db": ("dB", 0.0, 400.0),
+    "_m": ("m", 0.0, 1e9),
+    "_s": ("s", 0.0, 1e5),
+}
+
+
+def refuse_implausible(magnitudes: Magnitudes, radar: Any, world: Any, file: str) -> None:
+    """Check that all numbers with a unit have a magnitude that occurs.
+
+    Args:
+        magnitudes: Units and limits by the ending of a key, as in `MAGNITUDES`.
+        radar: The section radar with all defaults; None for recorded data.
+        world: The section world.
+        file: Name of the config, for messages.
+
+    Raises:
+        ConfigError: If a number has not. The message gives the unit, the accepted range and, if
+            there is one, a likely correction.
+    """
+    for key, value in _numbers({"radar": radar, "world": world}, ""):
+        unit, low, high = next((row for ending, row in magnitudes.items() if key.endswith(ending)), ("", 0.0, 1e300))
+        if value and not low <= abs(value) <= high:
+            prefixes = {"k": 1e3, "m": 1e-3, "M": 1e6, "u": 1e-6, "G": 1e9, "n": 1e-9}
+            fits = {p: value * x for p, x in prefixes.items() if max(low, 1e-12 * high) <= abs(value) * x <= high}
+            hint = next((f"; did you mean {value:g} {p}{unit}, which is {x:g}?" for p, x in fits.items()), "")
+            raise ConfigError(
+                f"{file}: {key} is {value:g} {unit}, and should be {low:g} {unit} to {high:g} {unit} in magnitude{hint}"
+            )
+
+
+def _numbers(tree: Any, path: str) -> Iterator[tuple[str, float]]:
+    """Every number of a tree with its dotted key; entries of a list have the key of the list."""
+    if isinstance(tree, Mapping):
+        for key, value in tree.items():
+            yield from _numbers(value, f"{path}.{key}".lstrip("."))
+    elif isinstance(tree, list | tuple):
+        for value in tree:
+            yield from _numbers(value, path)
+    elif isinstance(tree, int | float) and not isinstance(tree, bool):
+        yield path, tree
+
+
+# name of the only case of a config that lists none
+ALL = "all"
+# sections that are common to all cases
+_COMMON = ("title", "cases", "metrics", "trade", "sweep", "beyond_limits")
+
+
+def cases_of(loaded: Loaded) -> dict[str, Loaded]:
+    """Return the config of every case.
+
+    Args:
+        loaded: The config.
+
+    Returns:
+        Configs by the name of the case, in order. A config that lists no cases is its own only
+        case, with the name "all".
+
+    Raises:
+        ConfigError: If the name of a case is not valid, a case changes nothing, or it changes a key
+            that is common to all cases.
+    """
+    cases, file = loaded.config.cases, loaded.file
+    words: dict[str, str] = {}
+    for name, values in cases.items():
+        _check_case(name, values, loaded)
+        other = words.setdefault(word_of(name), name)
+        if other != name:
+            raise ConfigError(
+                f"{file}: the files of the cases {name!r} and {other!r} would have the same names; choose names that "
+                "differ in letters or digits"
+            )
+    changed = {name: loaded.changed(values, f"cases.{name}") for name, values in cases.items()}
+    for name, case in changed.items():
+        if list(case.config.processor) != list(loaded.config.processor):
+            raise ConfigError(
+                f"{file}: cases.{name} adds or removes a method, but every method runs on every case; a case may "
+                "change only keys of stages"
+            )
+    return changed or {ALL: loaded}
+
+
+def word_of(case: str) -> str:
+    """Return the name of a case in a form that is valid within the name of a file."""
+    return "".join(c if c.isalnum() else "_" for c in case)
+
+
+def key_of(case: str, name: str) -> str:
+    """Return the path of a result of a case; a '/' in the name of the case is replaced."""
+    return name if case == ALL else f"{case.replace('/', '_')}/{name}"
+
+
+def titled(title: str, case: str) -> str:
+    """Return a title with the name of the case."""
+    return title if case == ALL else f"{title}: {case}"
+
+
+def _check_case(name: str, values: Mapping[str, Any], loaded: Loaded) -> None:
+    """Raise ConfigError if the name of a case is not valid, or it changes a common key."""
+    unusable = fault_of_name(name.replace("/", "_"), LONGEST_NAME)
+    if not word_of(name).strip("_") or unusable or name in (*RESERVED, ALL):
+        raise ConfigError(
+            f"{loaded.file}: {name[:40]!r} is not a valid name of a case; it must contain letters or digits, must not "
+            f"begin with '__', must be printable with {LONGEST_NAME} bytes at most, and must be none of "
+            f"{', '.join((*RESERVED, ALL))}"
+        )
+    if not values:
+        raise ConfigError(
+            f"{loaded.file}: cases.{name} changes nothing; give it dotted keys with values, such as "
+            "world.noise.snr_db: 10.0"
+        )
+    for key in values:
+        root = key.split(".")[0]
+        if root in _COMMON or key == "world.trials":
+            raise ConfigError(
+                f"{loaded.file}: cases.{name}: the key {key!r} is common to all cases; a case may change radar, world, "
+                "data, processor, seed, random and precision"
+            )
+        if root == "data" and loaded.config.data.file is None:
+            raise ConfigError(
+                f"{loaded.file}: cases.{name}: a simulation does not use the key {key!r}; change the section world "
+                "instead, or set data.file for all cases to process a recording"
+            )

@@ -1,4 +1,6 @@
-"""Config sections from constructors: keys, types and defaults are those of their signatures."""
+"""Config sections from constructors: keys, types and defaults are those of their signatures, and
+errors of values are sentences.
+"""
 
 from __future__ import annotations
 
@@ -13,11 +15,10 @@ from functools import cached_property
 from typing import Any
 
 import torch
-from pydantic import BaseModel, ValidationError, create_model
+from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 from torch import Tensor
 
 from torchsar.study.settings.errors import ConfigError, did_you_mean, one_line
-from torchsar.study.settings.sentences import RENAMED, Strict, members_of, sentence
 
 _SCALARS = (float, int, str, bool, type(None))
 _YAML = (*_SCALARS, tuple, list)
@@ -79,6 +80,14 @@ class Section:
                     "cannot be written in a config; register a factory instead"
                 )
         return found
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether YAML can represent all required parameters."""
+        try:
+            return self.keys is not None
+        except TypeError:
+            return False
 
     @cached_property
     def model(self) -> type[BaseModel]:
@@ -171,7 +180,8 @@ class Catalogue:
     Args:
         what: Kind of the entries, for messages.
         key: The key of a config that holds the name.
-        entries: Classes or factories by name.
+        entries: Classes or factories, whose names in snake case are those of the entries, or a
+            mapping of other names to them.
         given: Parameters that are not keys of the config.
         automatic: Keys that may have the value `auto`, as `ENTRY.key`.
     """
@@ -180,11 +190,13 @@ class Catalogue:
         self,
         what: str,
         key: str,
-        entries: Mapping[str, Callable[..., Any]],
+        entries: Sequence[Callable[..., Any]] | Mapping[str, Callable[..., Any]],
         given: Sequence[str] = (),
         automatic: Sequence[str] = (),
     ) -> None:
-        self.what, self.key, self.entries = what, key, dict(entries)
+        self.what, self.key = what, key
+        named = {snake(one.__name__): one for one in entries} if isinstance(entries, Sequence) else entries
+        self.entries: dict[str, Callable[..., Any]] = dict(named)
         self.automatic = automatic
         free = [key.split(".") for key in automatic]
         self.sections = {
@@ -259,7 +271,7 @@ def _key(hint: Any, default: Any) -> Key | None:
         return Key(plain, value, per_trial={float, Tensor} <= scalars, as_tensor=as_tensor)
     classes: list[Any] = [arm for arm in arms if dataclasses.is_dataclass(arm)]
     if len(classes) > 1:
-        inner, many = Catalogue("choice", "kind", {_snake(c.__name__): c for c in classes}), ""
+        inner, many = Catalogue("choice", "kind", classes), ""
     else:
         inner, many = next((found for found in map(_inner, arms) if found[0] is not None), (None, ""))
     if inner is None:
@@ -342,5 +354,138 @@ def _is_index(text: str | None, value: Any) -> bool:
     return text is None or (text.isdecimal() and int(text) < len(value))
 
 
-def _snake(name: str) -> str:
-    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
+def snake(name: str) -> str:
+    """Return the name of a class in snake case: `OmegaKStolt` gives `omega_k_stolt`."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", name).lower()
+
+
+# keys, values, stages and kinds that were renamed; the message about an old one gives the new one
+RENAMED = {
+    "damages": "impairments",
+    "told": "trigger_known",
+    "published_ideal": "published.entropy_above_ideal_nats",
+    "damaged": "impaired",
+    **{
+        key: f"objective.{key}" for key in ("order", "range_term", "yc_m", "variables", "oversampling", "lines", "taps")
+    },
+    "rotation_phase_fit": "coarse_rotation, fits: 4",
+    "rotation_search": "entropy_rotation, method: grid",
+    **{
+        f"rotation_{name}": f"entropy_rotation, method: {name}"
+        for name in ("genetic", "evolution", "newton", "descent")
+    },
+    **{
+        f"{what}_{verb}": f"{verb}_{what}"
+        for verb, whats in {
+            "correct": ("imbalance", "response", "path", "pulse_phase", "migration"),
+            "remove": ("synchronisation", "transmit_range"),
+        }.items()
+        for what in whats
+    },
+    **{f"interference_{verb}": f"{verb}_interference" for verb in ("subtract", "notch", "drop")},
+    **{what: f"estimate_{what}" for what in ("imbalance", "response", "synchronisation")},
+    "response_flat_band": "estimate_flat_response",
+    "jitter_pilot": "pilot_jitter",
+    "jitter_blind": "blind_jitter",
+    "jitter_exact": "correct_jitter",
+    "jitter_lagrange": "correct_jitter, method: {kind: lagrange, points: 4}",
+    "jitter_band_limited": "correct_jitter, method: {kind: band_limited}",
+    "channel_balance": "estimate_balance",
+    "channel_balance_correct": "correct_balance",
+    "rotation": "uneven_rotation",
+    "rotation_coarse": "coarse_rotation",
+    "rotation_entropy": "entropy_rotation",
+    "rebuild_bands": "reconstruct",
+    "intensity_ratio": "signal_intensity_ratio",
+    "omega_k_padded": "padded_lines",
+    "focus_target": "focus_azimuth",
+    "dwell_s": "aperture.duration_s",
+    "bands": "rebuild.bands",
+    "u_r_reach_m_s": "search.u_r_m_s",
+    "u_a_reach_m_s": "search.u_a_m_s",
+    "y0_reach_m": "search.y0_m",
+    "straight": "straight_path",
+    "circular": "circular_path",
+    "plane": "plane_ground",
+    "normal": "start_phase",
+    "uniform": "uniform_start_phase",
+    "scintillation": "log_amplitude",
+    "polynomial": "polynomial_sweep_error",
+    "sinusoid": "sinusoid_sweep_error",
+    "fibre": "calibration_fibre",
+    "image": "image_sea",
+    "exact": "exact_range",
+    "taylor": "taylor_range",
+    "clock_errors": "synchronisation_error",
+    "channel_response": "smooth_response",
+}
+
+
+class Strict(BaseModel):
+    """Base of all sections; it rejects unknown keys, wrong types and infinities."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
+
+
+# order in which errors are reported: an unknown key, a missing key, a wrong value. If a number or a
+# list is accepted, the error of the number is more informative than that of the list.
+_RANK = {"extra_forbidden": 0, "missing": 1, "list_type": 3}
+
+
+def sentence(error: ValidationError, model: type[BaseModel], file: str, where: str = "") -> str:
+    """Return one sentence about the most informative of the errors of a validation.
+
+    Args:
+        error: Error of pydantic.
+        model: The model that was validated.
+        file: Name of the config.
+        where: Dotted path of the section that the model describes.
+
+    Returns:
+        The sentence, with file, key and value.
+    """
+    worst = min(error.errors(), key=lambda e: _RANK.get(e["type"], 2))
+    path = [str(part) for part in worst["loc"]]
+    names, section = _descend(model, path)
+    key, kind, given = ".".join(([where] if where else []) + names), worst["type"], worst.get("input")
+    if kind == "extra_forbidden":
+        new = RENAMED.get(path[-1], "")
+        if section is not None and new.split(".")[0] in section.model_fields:
+            return f"{file}: key {key!r} is now called {new!r}; rename it"
+        return f"{file}: key {key!r} is not known{did_you_mean(path[-1], section.model_fields if section else ())}"
+    if kind == "missing":
+        return f"{file}: key {key!r} is missing"
+    text = worst["msg"].removeprefix("Value error, ").removeprefix("Input ")
+    if kind in ("dict_type", "model_type", "too_short"):
+        text = "should be a mapping of keys" + (", and not an empty one" if kind == "too_short" else "")
+    if isinstance(given, str) and given in RENAMED:
+        text = f"should be {RENAMED[given]!r}, as it is now called"
+    if not key:  # an error of the whole config, not of one key
+        return f"{file}: {text}"
+    shown = repr(given)
+    if not text.startswith("should"):
+        return f"{file}: key {key!r}: {text}"
+    return f"{file}: key {key!r} has the value {shown if len(shown) < 80 else shown[:77] + '...'}; it {text}"
+
+
+def _descend(model: type[BaseModel], path: list[str]) -> tuple[list[str], type[BaseModel] | None]:
+    """The keys in a pydantic location, without tags of unions, and the section of the last key."""
+    names: list[str] = []
+    section, hint = None, model
+    for part in path:
+        members = members_of(hint)
+        hint = members[0] if len(members) == 1 else hint
+        if inspect.isclass(hint) and issubclass(hint, BaseModel):
+            names.append(part)
+            section, hint = hint, hint.model_fields[part].annotation if part in hint.model_fields else None
+        elif typing.get_origin(hint) in (dict, list):
+            names.append(part)
+            hint = typing.get_args(hint)[-1]
+    return names, section
+
+
+def members_of(hint: Any) -> list[Any]:
+    """Return the members of a union without None, or the type itself if it is no union."""
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        return [member for member in typing.get_args(hint) if member is not type(None)]
+    return [hint]

@@ -27,14 +27,19 @@ from torchsar.radar import InverseRadar, geometry_of
 from torchsar.scene import Dechirped, Motion, PhaseOnly, Points, Scene, Sinusoid, Together, TurntableWorld
 from torchsar.scene.turntable import Fidelity
 from torchsar.scene.vibration import PulsePhase, displacement_m
-from torchsar.study.names.factories import with_wavelength
-from torchsar.study.names.registry import FIDELITIES, MOTIONS, SCENES, START_PHASES, TARGET_IMPAIRMENTS
-from torchsar.study.output.pictures import Drawn, first_named
+from torchsar.study.names.registry import FIDELITIES, MOTIONS, SCENES, START_PHASES, TARGET_IMPAIRMENTS, with_wavelength
+from torchsar.study.output.report import Drawn, first_named
 from torchsar.study.settings.errors import ConfigError
-from torchsar.study.trials.batch import IMAGE, Batch, Judged, Result, Trials
+from torchsar.study.trials.batch import IMAGE, Batch, Judged, Result, Trials, last_values, used_values
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.choice import Alternative, Choice, Measured, beside_direct_sum
-from torchsar.study.trials.direct_images import DirectlySummed, turning_target
+from torchsar.study.trials.choice import (
+    Alternative,
+    Choice,
+    DirectlySummed,
+    Measured,
+    beside_direct_sum,
+    turning_target,
+)
 from torchsar.study.trials.system import Column, Noise, System, World
 
 
@@ -64,13 +69,7 @@ class Target(World):
     noise: Noise = field(default_factory=Noise)
     impairments: Mapping[str, Annotated[Impairment, TARGET_IMPAIRMENTS]] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.pulses < 1 or self.samples < 1 or not self.scene:
-            raise ValueError(
-                "world needs at least one scene, one pulse and one sample, got "
-                f"{len(self.scene)} scenes, {self.pulses} pulses and {self.samples} samples"
-            )
+    least = {"pulses": 1, "samples": 1, "scene": 1}
 
     def of(self, radar: InverseRadar) -> TurntableWorld:
         """The parameters of the echo simulation."""
@@ -157,13 +156,8 @@ def estimated_phase(chain: Chain, trace: Trace, like: Tensor) -> Tensor:
     estimate of a phase, or zero if there is none. Phases that are only initial values of another
     estimator do not count.
     """
-    taken = [
-        trace.arguments[name]["phase_rad"]
-        for name, uses in chain.uses.items()
-        if "phase_rad" in uses and name in trace.arguments
-    ]
-    found = taken or [e.value["phase_rad"] for e in trace.estimates.values() if "phase_rad" in e.value][-1:]
-    return sum((phase.to(torch.float64).reshape(like.shape) for phase in found), torch.zeros_like(like))
+    found = used_values(chain, trace, "phase_rad") or last_values(trace, "phase_rad")
+    return sum((phase.reshape(like.shape) for phase in found), torch.zeros_like(like))
 
 
 def _bound_ratio(bench: Bench) -> float | None:

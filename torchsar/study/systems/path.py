@@ -35,12 +35,11 @@ from torchsar.scene import Flight, Navigation, PathWorld, PlaneGround, Points, S
 from torchsar.scene.flight import NominalPath
 from torchsar.scene.path import Ground
 from torchsar.study.names.registry import GROUNDS, NOMINAL_PATHS, PATH_IMPAIRMENTS, SCENES, AntennaMotions
-from torchsar.study.output.pictures import Drawn, first_named
+from torchsar.study.output.report import Drawn, first_named
 from torchsar.study.systems.isal import estimated_phase, received
 from torchsar.study.trials.batch import IMAGE, Batch, Judged, Metrics, Processed, Result, Trials
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.choice import Alternative, Choice, Measured
-from torchsar.study.trials.direct_images import some_pixels, white_noise
+from torchsar.study.trials.choice import Alternative, Choice, Measured, some_pixels, white_noise
 from torchsar.study.trials.system import Column, Noise, System, World, by_limit
 
 

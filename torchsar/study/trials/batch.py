@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchsar.core import Draws, Estimate, Outcome, Recording, Signal, Trace, Truth
+from torchsar.core import Chain, Draws, Estimate, Outcome, Recording, Signal, Trace, Truth
 
 OK, OUTCOME = "ok", "outcome"
 IMAGE = ("azimuth", "range")
@@ -201,6 +201,17 @@ def rows(x: Tensor, count: int) -> Tensor:
     return (
         x.reshape(count, -1) if x.numel() and x.numel() % count == 0 and x.ndim else x.reshape(1, -1).expand(count, -1)
     )
+
+
+def used_values(chain: Chain, trace: Trace, name: str) -> list[Tensor]:
+    """Return what each stage of a chain was given for a value, in float64, as far as it ran."""
+    users = [stage for stage, uses in chain.uses.items() if name in uses and stage in trace.arguments]
+    return [trace.arguments[stage][name].to(torch.float64) for stage in users]
+
+
+def last_values(trace: Trace, name: str) -> list[Tensor]:
+    """Return the last estimate of a value by a chain, in float64; nothing if there is none."""
+    return [e.value[name].to(torch.float64) for e in trace.estimates.values() if name in e.value][-1:]
 
 
 def image_of(signal: Signal, trial: int = 0) -> Signal:

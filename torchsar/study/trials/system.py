@@ -14,9 +14,8 @@ from torch import Tensor
 from torchsar.core import Draws, Recording, Signal, Trace
 from torchsar.focus.requirements import Limit, Requirement
 from torchsar.study.names.registry import stages
-from torchsar.study.output.pictures import Drawn, comparisons
-from torchsar.study.settings.cases import ALL, titled, word_of
-from torchsar.study.settings.sections import Loaded
+from torchsar.study.output.report import Column, Drawn, comparisons
+from torchsar.study.settings.sections import ALL, MAGNITUDES, Loaded, Magnitudes, titled, word_of
 from torchsar.study.settings.signature import Catalogue, Section
 from torchsar.study.trials.batch import IMAGE, Batch, Found, Judged, Processed, Result, Trials
 from torchsar.study.trials.bench import Bench
@@ -38,20 +37,44 @@ class Noise:
 class World:
     """Base of the section `world` of every system: the true scene, which no processor may use.
 
+    Class attributes:
+        least: Least size of fields that are whole numbers or collections.
+
     Args:
         trials: Number of trials of each case of a run; a sweep has its own number.
     """
 
+    least: ClassVar[Mapping[str, int]] = {}
     trials: int = 1
 
     def __post_init__(self) -> None:
-        if self.trials < 1:
-            raise ValueError(f"world.trials must be at least 1, got {self.trials}")
+        for name, least in {"trials": 1, **self.least}.items():
+            value = getattr(self, name)
+            size = value if isinstance(value, int) else len(value)
+            if size < least:
+                raise ValueError(f"world needs at least {least} {name}, got {size}")
 
 
-@dataclass(frozen=True)
+def named_points(scene: Mapping[str, Any], shown: Mapping[type, int | None]) -> dict[str, int]:
+    """Return names of point targets, such as `points.0`, and their indices among all scatterers.
+
+    Args:
+        scene: Parts of the scene by name.
+        shown: Kinds of parts whose scatterers have names, with the largest number of them; None for
+            all.
+    """
+    names: dict[str, int] = {}
+    first = 0
+    for part, one in scene.items():
+        count = one.scatterers(Draws(0)).range_m.shape[-1]
+        names |= {f"{part}.{i}": first + i for i in range(count)[: shown.get(type(one), 0)]}
+        first += count
+    return names
+
+
+@dataclass(frozen=True, kw_only=True)
 class Judging:
-    """The section `metrics` of systems without further settings of their metrics.
+    """The section `metrics` of systems with a reference method, to which they may add settings.
 
     Args:
         reference: The method with the ideal image of the same scene.
@@ -59,25 +82,7 @@ class Judging:
     """
 
     reference: str | None = None
-    published: Mapping[str, Mapping[str, Mapping[str, float]]] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Column:
-    """Presentation of a metric in reports and pictures.
-
-    Args:
-        label: Its name in words.
-        unit: Its unit for tables and axes; SI units are shown with prefixes.
-        digits: Number of digits after the decimal point.
-        drawn: Statistic over trials in the picture that compares methods: "mean", "rms", or "" for
-            no picture.
-    """
-
-    label: str
-    unit: str = ""
-    digits: int = 3
-    drawn: str = ""
+    published: Mapping[str, Mapping[str, Mapping[str, float | str]]] = field(default_factory=dict)
 
 
 Draw = Callable[[Result], Drawn]
@@ -100,6 +105,8 @@ class System(ABC):
         columns: Metrics in reports.
         target_columns: Metrics of named targets in reports.
         tolerance: Default of the largest acceptable loss, by metric.
+        magnitudes: Units and accepted magnitudes of the numbers of radar and world, by the ending
+            of their keys.
         exact: For each key that may be `auto` (see `Choice.at`), the keys and values that select
             the exact alternative.
         images: Axes of signals that are images.
@@ -124,6 +131,7 @@ class System(ABC):
     columns: ClassVar[Mapping[str, Column]]
     target_columns: ClassVar[Mapping[str, Column]] = {}
     tolerance: ClassVar[Mapping[str, float]] = {}
+    magnitudes: ClassVar[Magnitudes] = MAGNITUDES
     exact: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
     images: ClassVar[Sequence[tuple[str, ...]]] = (IMAGE,)
     settings: ClassVar[Mapping[str, str]] = {}

@@ -17,7 +17,7 @@ from torchsar.metrics import bistatic_bounds
 from torchsar.multichannel.reconstruct import noise_and_clutter
 from torchsar.radar import BistaticRadar
 from torchsar.study.names.registry import MULTICHANNEL_IMPAIRMENTS
-from torchsar.study.output.pictures import Drawn, comparisons
+from torchsar.study.output.report import Drawn, comparisons
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.settings.sections import Loaded
 from torchsar.study.systems.geo import choices, figures
@@ -76,9 +76,9 @@ class Geo(System):
     peak = 12.0
     tolerance = {"image_error_db": -20.0, "echo_error_db": -20.0, "mfta_db": -50.0, "width_change_percent": 1.0}
     exact = {
-        "world.receive": {"kind": "exact"},
-        "transmit_range_remove.order": {"order": None},
-        "migration_correct.kind": {"kind": "keystone"},
+        "world.receive": {"kind": "exact_range"},
+        "remove_transmit_range.order": {"order": None},
+        "correct_migration.migration": {"migration": {"kind": "keystone", "whole_swath": True}},
     }
     definitions = {
         "snr": "power of the target over noise variance in one range-compressed sample of one channel, dB "

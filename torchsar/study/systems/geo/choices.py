@@ -47,8 +47,14 @@ from torchsar.study.systems.geo.judge import FocusedPoint, PeakCuts, point_respo
 from torchsar.study.systems.geo.world import TRUTHS, Level, Points
 from torchsar.study.trials.batch import Trials
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.choice import Alternative, Choice, Measured, beside_direct_sum
-from torchsar.study.trials.direct_images import DirectlySummed, points_at_rest
+from torchsar.study.trials.choice import (
+    Alternative,
+    Choice,
+    DirectlySummed,
+    Measured,
+    beside_direct_sum,
+    points_at_rest,
+)
 from torchsar.study.trials.system import by_limit
 
 _ESTIMATORS: dict[type, Estimator] = {
@@ -66,9 +72,13 @@ _PATTERN_S = 4.5
 _LINES, _APERTURES = 128, 1.5
 # corrections of range migration, and the rows of the requirements that are about their losses
 _MIGRATIONS = {
-    "none": (NoMigration(), "no range migration correction"),
-    "static_bulk": (StaticBulk(True), "static bulk correction, velocity unknown"),
-    "keystone": (Keystone(True), ""),
+    "none": (NoMigration(), {"kind": "no_migration"}, "no range migration correction"),
+    "static_bulk": (
+        StaticBulk(True),
+        {"kind": "static_bulk", "whole_swath": True},
+        "static bulk correction, velocity unknown",
+    ),
+    "keystone": (Keystone(True), {"kind": "keystone", "whole_swath": True}, ""),
 }
 _DIMENSIONS = ("azimuth only", "range lines", "full chirps")
 
@@ -150,17 +160,17 @@ def choices(bench: Bench) -> list[Choice]:
     migrations = [
         Alternative(
             kind,
-            {"kind": kind},
+            {"migration": _MIGRATIONS[kind][1]},
             {"image_error_db": focused.migration_db(kind == "static_bulk", known=_follows(bench))},
             "migration that remains",
-            _MIGRATIONS[kind][1],
+            _MIGRATIONS[kind][2],
         )
         for kind in ("none", "static_bulk")
     ]
     series = [
         Alternative(
             f"order {n}",
-            {"kind": "taylor", "order": n},
+            {"kind": "taylor_range", "order": n},
             {"echo_error_db": seen.receive_model_db(TaylorRange(n))},
             "higher orders",
         )
@@ -176,12 +186,12 @@ def choices(bench: Bench) -> list[Choice]:
     dimensions = [Alternative(name, {"dimensions": name}) for name in _DIMENSIONS]
     precisions = [Alternative(name, {"precision": name}) for name in ("complex64", "complex128")]
     orders.append(Alternative("all orders", {"order": None}, {}))
-    migrations.append(Alternative("keystone", {"kind": "keystone", "whole_swath": True}, {}))
-    series.append(Alternative("exact", {"kind": "exact"}, {}))
+    migrations.append(Alternative("keystone", {"migration": _MIGRATIONS["keystone"][1]}, {}))
+    series.append(Alternative("exact", {"kind": "exact_range"}, {}))
     return [
-        Choice("order of the transmit range", "transmit_range_remove.order", orders, partial(_orders, bench)),
-        Choice("range migration", "migration_correct.kind", migrations, partial(_migrated, bench)),
-        Choice("reconstruction", "rebuild_bands", rebuilt, partial(_rebuilt, bench)),
+        Choice("order of the transmit range", "remove_transmit_range.order", orders, partial(_orders, bench)),
+        Choice("range migration", "correct_migration.migration", migrations, partial(_migrated, bench)),
+        Choice("reconstruction", "reconstruct", rebuilt, partial(_rebuilt, bench)),
         Choice("range to the receiver", "world.receive", series, partial(_received, bench)),
         Choice("dimensions", "world.samples", dimensions, partial(_dimensions, bench)),
         Choice("precision", "precision", precisions, partial(_precisions, bench)),
@@ -261,7 +271,7 @@ def _migrated(bench: Bench) -> Measured:
     exact = Signal(line.data[..., None] * across[:, None], (*line.axes, lines))
     return _compared(
         exact,
-        lambda one: _image(bench, trials, band, migration=_MIGRATIONS[one.keys["kind"]][0], follow=_follows(bench))[0],
+        lambda one: _image(bench, trials, band, migration=_MIGRATIONS[one.name][0], follow=_follows(bench))[0],
         size["pulses"] / bench.world().pulses,
     )
 
@@ -288,7 +298,7 @@ def _received(bench: Bench) -> Measured:
     """Echoes by each model of the receive range."""
 
     def echo(one: Alternative, dtype: torch.dtype | None = None) -> Tensor:
-        model = TaylorRange(one.keys["order"]) if one.keys["kind"] == "taylor" else ExactRange()
+        model = TaylorRange(one.keys["order"]) if one.keys["kind"] == "taylor_range" else ExactRange()
         return _alone(bench, dtype, receive=model).clean.signal.data
 
     exact = _alone(bench, torch.complex128, receive=ExactRange()).clean.signal.data

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from torchsar import plot
 from torchsar.core import Signal
-from torchsar.study.output.pictures import Drawn
-from torchsar.study.settings.cases import key_of
+from torchsar.study.output.report import Drawn
+from torchsar.study.settings.sections import key_of
 from torchsar.study.systems.geo.judge import PeakCuts
 from torchsar.study.trials.batch import Result
 from torchsar.study.trials.cuts import about_peak, finer

@@ -25,7 +25,7 @@ from torchsar.scene.bistatic import Gate
 from torchsar.scene.movers import Movers
 from torchsar.scene.sea import Sea
 from torchsar.study.names.registry import GATES, SEAS
-from torchsar.study.output.pictures import Drawn, comparisons
+from torchsar.study.output.report import Drawn, comparisons
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.systems.geo.figures import by_target
 from torchsar.study.systems.geo.world import TRUTHS, bistatic_radar

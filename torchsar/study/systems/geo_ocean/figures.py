@@ -10,7 +10,7 @@ import torch
 
 from torchsar import plot
 from torchsar.core import Signal
-from torchsar.study.output.pictures import Drawn
+from torchsar.study.output.report import Drawn
 from torchsar.study.systems.geo_ocean.judge import ImagePosition, MadeScene, ShownShip
 from torchsar.study.trials.batch import Result
 

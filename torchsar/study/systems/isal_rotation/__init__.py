@@ -18,15 +18,15 @@ from torchsar.focus.requirements import Limit
 from torchsar.metrics import contrast, entropy, rotation_bounds
 from torchsar.radar import InverseRadar
 from torchsar.scene import Points, PolynomialRotation, Scatterers, Scene, Together, TurntableWorld
-from torchsar.study.names.factories import with_wavelength
-from torchsar.study.names.registry import TARGET_IMPAIRMENTS
+from torchsar.study.names.registry import TARGET_IMPAIRMENTS, with_wavelength
 from torchsar.study.systems.isal import Target
 from torchsar.study.systems.isal import target as draw_target
 from torchsar.study.systems.isal_rotation import choices, figures
 from torchsar.study.systems.isal_rotation.judge import CrossRangeCut, FoundRotation, cross_range_cut, k_scales, true_k
+from torchsar.study.trials import system
 from torchsar.study.trials.batch import IMAGE, Batch, Judged, Processed, Trials
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.system import Column, System
+from torchsar.study.trials.system import Column, System, named_points
 
 
 @dataclass(frozen=True)
@@ -78,13 +78,7 @@ class Rotating(Target):
     @property
     def named_points(self) -> dict[str, int]:
         """Names of the point targets, `part.number`, and their indices among all scatterers."""
-        names: dict[str, int] = {}
-        first = 0
-        for part, one in self.scene.items():
-            if isinstance(one, Points):
-                names.update({f"{part}.{i}": first + i for i in range(len(one.azimuth_m))})
-            first += one.scatterers(Draws(0)).range_m.shape[-1]
-        return names
+        return named_points(self.scene, {Points: None})
 
     def noise_std(self, amplitude: Tensor) -> float:
         """Return the standard deviation of the noise in a sample; 0 without noise.
@@ -105,21 +99,17 @@ class Rotating(Target):
 _OF_ESTIMATORS = {"scatterers above the noise": "warp_k", "range term, pi lambda sigma_y / ra^2": "omega_rad_s"}
 
 
-@dataclass(frozen=True)
-class Judging:
+@dataclass(frozen=True, kw_only=True)
+class Judging(system.Judging):
     """Settings of the metrics.
 
     Args:
-        reference: Name of the method whose image of the same scene is the ideal one.
         search_m: Largest distance in metres along cross range between the response of a point
             target and its true position.
-        published: Published values by metric, case and method.
         published_targets: Published values of point targets, by metric, target and method.
     """
 
-    reference: str | None = None
     search_m: float = 0.1
-    published: Mapping[str, Mapping[str, Mapping[str, float]]] = field(default_factory=dict)
     published_targets: Mapping[str, Mapping[str, Mapping[str, float]]] = field(default_factory=dict)
 
 
@@ -145,7 +135,7 @@ class IsalRotation(System):
     tolerance = {"echo_error_db": -20.0, "image_error_db": -20.0, "peak_loss_db": 0.25, "k1_error_percent": 0.1}
     exact = {
         "world.fidelity": {"kind": "dechirped", "track_m": None},
-        "rotation.order": {"order": 4},
+        "uneven_rotation.order": {"order": 4},
         "matched_fourier.transform": {"transform": {"kind": "explicit_sum"}},
     }
     definitions = {

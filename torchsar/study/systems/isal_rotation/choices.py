@@ -27,8 +27,14 @@ from torchsar.scene import PhaseOnly, Points
 from torchsar.study.systems.isal import echo_choices
 from torchsar.study.trials.batch import Trials
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.choice import Alternative, Choice, Measured, beside_direct_sum
-from torchsar.study.trials.direct_images import DirectlySummed, turning_target
+from torchsar.study.trials.choice import (
+    Alternative,
+    Choice,
+    DirectlySummed,
+    Measured,
+    beside_direct_sum,
+    turning_target,
+)
 from torchsar.study.trials.system import Noise
 
 # orders of the rotation that are compared, and more where the target has more
@@ -95,7 +101,7 @@ def choices(bench: Bench) -> list[Choice]:
     ]
     found = [Alternative(name, {"estimator": work}) for name, work in _ESTIMATORS.items()]
     return [
-        Choice("order of the rotation", "rotation.order", orders, partial(_orders, bench)),
+        Choice("order of the rotation", "uneven_rotation.order", orders, partial(_orders, bench)),
         Choice("range term", "range_phase", range_terms, partial(_range_terms, bench)),
         Choice("transform", "matched_fourier.transform", transforms, partial(_transforms, bench)),
         beside_direct_sum(partial(_summed, bench), "migration, range in a cell"),
@@ -283,7 +289,7 @@ def _estimates(bench: Bench) -> Measured:
     trials, radar = bench.trials(_draws(bench)), bench.radar
     signal, truth = trials.clean.signal, trials.truth
     stages = (bench.config.processor["recommended"].stages or {}).values()
-    yc = next((entry.get("yc_m") for entry in stages if str(entry["stage"]).startswith("rotation")), None)
+    yc = next((entry.get("yc_m") for entry in stages if "rotation" in str(entry["stage"])), None)
     known = {"wavelength_m": radar.wavelength_m, "prf_hz": radar.prf_hz, "range_m": signal.axis("range").values()}
     known |= {"yc_m": yc, "order": max(2, truth["warp_k"].shape[-1] + 1)}
     true = {name: truth[name] for name in ("omega_rad_s", "warp_k")}

@@ -8,7 +8,7 @@ from typing import Any
 
 from torchsar import plot
 from torchsar.core import Axis, Signal
-from torchsar.study.output.pictures import Drawn, first_named
+from torchsar.study.output.report import Drawn, first_named
 from torchsar.study.systems.isal_rotation.judge import CrossRangeCut
 from torchsar.study.trials.batch import Result
 

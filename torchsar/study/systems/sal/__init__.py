@@ -37,7 +37,6 @@ from torchsar.scene import (
 )
 from torchsar.scene.ladar import SweepError
 from torchsar.scene.ladar_range import Fidelity
-from torchsar.study.names.factories import with_wavelength
 from torchsar.study.names.registry import (
     CALIBRATIONS,
     LADAR_IMPAIRMENTS,
@@ -47,13 +46,15 @@ from torchsar.study.names.registry import (
     SWEEP_ERRORS,
     SWEEP_FIDELITIES,
     group_of,
+    with_wavelength,
 )
 from torchsar.study.settings.errors import ConfigError, did_you_mean
 from torchsar.study.systems.sal import choices, figures
 from torchsar.study.systems.sal.judge import Course, course_of, target_responses
+from torchsar.study.trials import system
 from torchsar.study.trials.batch import IMAGE, Batch, Judged, Trials
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.system import Column, Noise, System, World
+from torchsar.study.trials.system import Column, Noise, System, World, named_points
 
 
 @dataclass(frozen=True)
@@ -91,6 +92,7 @@ class Ground(World):
         impairments: Impairments of the recording by name, applied in this order.
     """
 
+    least = {"periods": 1, "scene": 1}
     periods: int
     scene: Mapping[str, Annotated[Scene, SCENES]]
     motion: Sequence[Annotated[Motion, RADIAL_MOTIONS]] = ()
@@ -106,10 +108,6 @@ class Ground(World):
     def __post_init__(self) -> None:
         super().__post_init__()
         snr_db = self.noise.snr_db
-        if self.periods < 1 or not self.scene:
-            raise ValueError(
-                f"world needs at least one scene and one period, got {len(self.scene)} scenes, {self.periods} periods"
-            )
         if snr_db is not None and bool((torch.as_tensor(snr_db).abs() > 300).any()):
             raise ValueError(
                 f"noise.snr_db is {snr_db}, outside the numerical range; give -300 to 300 dB, or null for no noise"
@@ -136,36 +134,26 @@ class Ground(World):
         """Names `part.number` of point targets and retro-reflectors, whose responses are measured,
         and their indices among all scatterers.
         """
-        names: dict[str, int] = {}
-        first = 0
-        for part, scene in self.scene.items():
-            shown = len(scene.azimuth_m) if isinstance(scene, Points) else int(isinstance(scene, RetroAndBrokenLine))
-            names.update({f"{part}.{i}": first + i for i in range(shown)})
-            first += scene.scatterers(Draws(0)).range_m.shape[-1]
-        return names
+        return named_points(self.scene, {Points: None, RetroAndBrokenLine: 1})
 
 
 log = logging.getLogger("torchsar")
 
 
-@dataclass(frozen=True)
-class Judging:
+@dataclass(frozen=True, kw_only=True)
+class Judging(system.Judging):
     """Settings of the metrics.
 
     Args:
-        reference: Method whose image of the same scene is the ideal one; null for none.
         target: Point target whose impulse response is measured and drawn; null for none.
         sidelobe_nulls: Distance from the peak up to which side lobes are measured, in null spacings
             of a rectangular band.
         search_m: Half width in metres of the search for a response about its predicted position.
-        published: Published values by metric, case and method.
     """
 
-    reference: str | None = None
     target: str | None = None
     sidelobe_nulls: int = 10
     search_m: float = 0.02
-    published: Mapping[str, Mapping[str, Mapping[str, float]]] = field(default_factory=dict)
 
 
 class Sal(System):

@@ -24,8 +24,7 @@ from torchsar.scene.moved_scene import Moved
 from torchsar.study.names.registry import SWEEP_FIDELITIES
 from torchsar.study.systems.sal.judge import lit_periods
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.choice import Alternative, Choice, Measured, beside_direct_sum
-from torchsar.study.trials.direct_images import DirectlySummed, ladar_strip
+from torchsar.study.trials.choice import Alternative, Choice, DirectlySummed, Measured, beside_direct_sum, ladar_strip
 from torchsar.study.trials.system import Noise
 
 # limits that stop only methods with such a stage, whose key has that value

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchsar import plot
 from torchsar.core import Axis, Signal
-from torchsar.study.output.pictures import Drawn, first_named
+from torchsar.study.output.report import Drawn, first_named
 from torchsar.study.systems.sal.judge import Course, finer_in_range
 from torchsar.study.trials.batch import Result, image_of
 from torchsar.study.trials.cuts import impulse_cuts

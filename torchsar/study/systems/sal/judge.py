@@ -14,6 +14,7 @@ from torchsar.core import Axis, Chain, Signal, Trace, unit_phasor
 from torchsar.metrics.impulse import impulse_response
 from torchsar.radar import TriangularLadar, sweep_middles
 from torchsar.radar.ladar import leading
+from torchsar.study.trials.batch import last_values, used_values
 
 SWEEPS = ("ramp", "pulse", "fast_time")
 
@@ -264,11 +265,7 @@ def _summed(chain: Chain, trace: Trace, name: str, used_only: bool = False) -> T
     """Sum over the stages that use a value of what they are given; without any, the last estimate
     of it; None where there is none.
     """
-    taken = [
-        trace.arguments[stage][name].to(torch.float64)
-        for stage, uses in chain.uses.items()
-        if name in uses and stage in trace.arguments
-    ]
+    taken = used_values(chain, trace, name)
     if not taken and not used_only:
-        taken = [e.value[name].to(torch.float64) for e in trace.estimates.values() if name in e.value][-1:]
+        taken = last_values(trace, name)
     return torch.stack(taken).sum(0) if taken else None

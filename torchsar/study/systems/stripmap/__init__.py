@@ -23,18 +23,18 @@ from torchsar.metrics.bounds import reference_doppler_std_hz, tone_frequency_bou
 from torchsar.radar import StripmapRadar
 from torchsar.scene import AlwaysLit, Hyperbola, Points, RandomPoints, Scene, StripmapWorld, Together
 from torchsar.scene.strip import Beam, Path
-from torchsar.study.names.factories import with_wavelength
-from torchsar.study.names.registry import BEAMS, IMPAIRMENTS, PATHS, SCENES
-from torchsar.study.output.pictures import Drawn, comparisons
+from torchsar.study.names.registry import BEAMS, IMPAIRMENTS, PATHS, SCENES, with_wavelength
+from torchsar.study.output.report import Drawn, comparisons
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.settings.sections import Loaded
 from torchsar.study.systems.stripmap import figures
 from torchsar.study.systems.stripmap.choices import choices, probe_of
 from torchsar.study.systems.stripmap.image import Margin, Used, window
+from torchsar.study.trials import system
 from torchsar.study.trials.batch import IMAGE, Batch, Judged, Processed, Result, Trials
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Choice
-from torchsar.study.trials.system import Column, Noise, System, World
+from torchsar.study.trials.system import Column, Noise, System, World, named_points
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,6 +54,7 @@ class Strip(World):
         impairments: Impairments of the recording by name, in the order of their effect.
     """
 
+    least = {"lines": 2, "samples": 2, "scene": 1}
     lines: int
     samples: int
     scene: Mapping[str, Annotated[Scene, SCENES]]
@@ -67,11 +68,6 @@ class Strip(World):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.lines < 2 or self.samples < 2 or not self.scene:
-            raise ValueError(
-                f"world needs at least one scene, 2 lines and 2 samples, got {len(self.scene)} scenes, "
-                f"{self.lines} lines and {self.samples} samples"
-            )
         if self.doppler_hz is not None and self.squint_deg is not None:
             raise ValueError("doppler_hz and squint_deg both give the direction of the beam; give one of them")
         if self.velocity_m_s is not None and bool((torch.as_tensor(self.velocity_m_s) <= 0).any()):
@@ -105,43 +101,32 @@ class Strip(World):
         A name is the key of the scene part in the config and the number of the target in this part,
         such as `points.0`.
         """
-        names: dict[str, int] = {}
-        first = 0
-        for part, scene in self.scene.items():
-            count = len(scene.azimuth_m) if isinstance(scene, Points) else getattr(scene, "count", 0)
-            if isinstance(scene, (Points, RandomPoints)):
-                names.update({f"{part}.{i}": first + i for i in range(count)})
-            first += count
-        return names
+        return named_points(self.scene, {Points: None, RandomPoints: None})
 
 
 _UNIT = re.compile(r"_(hz|m_s|m|s|rad|deg|db)$")
 _FIGURES = ("irw_azimuth_m", "irw_range_m", "pslr_azimuth_db", "pslr_range_db", "islr_azimuth_db", "islr_range_db")
 
 
-@dataclass(frozen=True)
-class Judging:
+@dataclass(frozen=True, kw_only=True)
+class Judging(system.Judging):
     """Settings of the metrics.
 
     Args:
         margin: Edges of the image that the metrics leave out; None for lines without a full
             aperture and samples without a full pulse.
-        reference: Name of the method with which images and peaks are compared.
         sidelobe_nulls: Distance from the peak up to which side lobes are measured, in null spacings
             of a rectangular band.
         found_within_m: Largest distance in metres between the peak and the true position of a
             target that counts as found.
         found_above_db: Lowest peak of a target that counts as found, in dB relative to the
             reference.
-        published: Published values by metric, case and method.
     """
 
     margin: Margin | None = None
-    reference: str | None = None
     sidelobe_nulls: int = 10
     found_within_m: float = 10.0
     found_above_db: float = -6.0
-    published: Mapping[str, Mapping[str, Mapping[str, float | str]]] = field(default_factory=dict)
 
 
 def estimation_metrics(trace: Trace, trials: Trials, prf_hz: float) -> dict[str, Tensor]:

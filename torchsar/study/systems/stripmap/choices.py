@@ -20,10 +20,17 @@ from torchsar.metrics import error_after_gain_db, error_db
 from torchsar.radar import StripmapRadar
 from torchsar.repair.jitter import BandLimited, Exact, Lagrange
 from torchsar.scene import Dwell, Hyperbola, Parabola, Points, StripmapWorld
-from torchsar.study.names.registry import FOCUS
+from torchsar.study.names.registry import GROUPS
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.choice import Alternative, Choice, Measured, beside_direct_sum
-from torchsar.study.trials.direct_images import PIXELS, DirectlySummed, points_of_a_strip
+from torchsar.study.trials.choice import (
+    PIXELS,
+    Alternative,
+    Choice,
+    DirectlySummed,
+    Measured,
+    beside_direct_sum,
+    points_of_a_strip,
+)
 
 # a period of four timing offsets (samples) as in Tsvetkov 2017, and raw lines enough to time them
 _OFFSETS, _LINES = (0.0, 0.18, -0.12, 0.07), 1024
@@ -147,7 +154,7 @@ def choices(bench: Bench, rows: Mapping[str, Requirement]) -> list[Choice]:
         ]
         found.append(Choice("range history", "world.path", histories, partial(_histories, bench)))
     stages = (bench.config.processor["recommended"].stages or {}).values()
-    if any(entry["stage"].startswith("jitter_") for entry in stages):
+    if any("jitter" in entry["stage"] for entry in stages):
         correctors = [Alternative(name, {"corrector": c}) for name, c in _CORRECTORS.items()]
         found.append(Choice("jitter correction", "stage of the name jitter", correctors, partial(_jitter, bench)))
     return found
@@ -155,7 +162,7 @@ def choices(bench: Bench, rows: Mapping[str, Requirement]) -> list[Choice]:
 
 def _focused(bench: Bench, form: str, signal: Signal, known: tuple[Tensor, Tensor]) -> Tensor:
     """The image by a form, with given Doppler and velocity."""
-    return FOCUS[form](bench.radar, "matched", velocity_m_s=known[1], doppler_hz=known[0])(signal).data
+    return GROUPS["focus"][form](bench.radar, "matched", velocity_m_s=known[1], doppler_hz=known[0])(signal).data
 
 
 def _forms(bench: Bench) -> Measured:
