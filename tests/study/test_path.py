@@ -166,3 +166,22 @@ def test_a_motion_log_is_flown(tmp_path: Path) -> None:
     straight = metrics_of(bench_of(tmp_path, "path"))
     for key in ("entropy_nats", "path_residual_rms_m"):
         torch.testing.assert_close(found["ideal"][key], straight["ideal"][key], rtol=1e-3, atol=1e-9)
+
+
+def test_what_a_flight_requires(tmp_path: Path) -> None:
+    """A sway of 0.3 m along x at 1 Hz over one period, 45 degrees from the line of sight, and a
+    recorded speed that is 2 m/s too high.
+    """
+    drift = {"y": {"drift": {"kind": "polynomial", "coefficients_m": [2.0]}}}
+    bench = bench_of(tmp_path, "path", world=world("path", navigation=drift))
+    rows = {row.effect: row for row in bench.system.requirements(bench)}
+    time = np.arange(96) / 100
+    sway = 0.3 * np.sin(2 * np.pi * time) / np.sqrt(2)
+    left = np.abs(sway - np.polyval(np.polyfit(time, sway, 1), time)).max()
+    turn = 4 * np.pi * 9.6e9 / LIGHT_M_S
+    assert rows["a straight path"].phase_rad == pytest.approx(turn * left, rel=0.05) and not rows["a straight path"].ok
+    # 2 m/s too fast at 100 m/s: after half of 0.96 s the range differs by v dv t^2 / R
+    distance = 1500 * np.sqrt(2)
+    assert rows["the recorded speed"].phase_rad == pytest.approx(turn * 100 * 2 * 0.48**2 / distance, rel=0.05)
+    assert "an error of 2 m/s" in rows["the recorded speed"].neglects and rows["the recorded path"].ok
+    assert rows["an antenna at rest during an echo"].ok

@@ -89,6 +89,22 @@ def nominal_geometry(radar: InverseRadar, world: PathWorld, n_pulse: int, n_rang
     return path, _frequencies_hz(radar, n_range)
 
 
+def flown_paths(radar: InverseRadar, world: PathWorld, n_pulse: int, draws: Draws) -> tuple[AntennaPath, AntennaPath]:
+    """Return the true paths of antennas and those that navigation records, in each trial.
+
+    Args:
+        radar: Pulse repetition frequency.
+        world: Paths, their deviations and what navigation records of them.
+        n_pulse: Number of pulses.
+        draws: Random draws of the trials.
+
+    Returns:
+        True and recorded paths, as in the simulation of `simulate_path`.
+    """
+    flown = _Flown.of(world, draws, torch.arange(n_pulse, dtype=torch.float64) / radar.prf_hz)
+    return flown.true, flown.recorded
+
+
 def _frequencies_hz(radar: InverseRadar, n: int, device: torch.device | str | None = None) -> Tensor:
     """Frequencies of the n samples of a phase history, float64 (n,)."""
     number = torch.arange(n, dtype=torch.float64, device=device) - n // 2

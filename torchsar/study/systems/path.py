@@ -16,10 +16,10 @@ from torchsar import plot
 from torchsar.compensate.pulse_phase.data import without_line
 from torchsar.core import Chain, Draws, Recording, Signal, Trace, per_trial
 from torchsar.echo import Impairment, simulate_path
-from torchsar.echo.path import nominal_geometry
+from torchsar.echo.path import flown_paths, nominal_geometry
 from torchsar.focus import MotionCompensation, OmegaKImage, PathImage, TilePlan, backproject
 from torchsar.focus.path_image import last_image, possible_plans, seen_in
-from torchsar.focus.requirements import Limit
+from torchsar.focus.requirements import Limit, Requirement
 from torchsar.io import read_history
 from torchsar.metrics import (
     contrast,
@@ -30,7 +30,7 @@ from torchsar.metrics import (
     registered_error_db,
     residual_phase,
 )
-from torchsar.radar import AntennaPath, InverseRadar
+from torchsar.radar import LIGHT_M_S, AntennaPath, InverseRadar
 from torchsar.scene import Flight, Navigation, PathWorld, PlaneGround, Points, Scene, SideBeam, Sway, Together
 from torchsar.scene.flight import NominalPath
 from torchsar.scene.path import Ground
@@ -386,6 +386,15 @@ class AnyPath(System):
         beam = None if bench.recording is not None else bench.world().beam
         return found if beam is None else {**found, _band_limit(bench.radar, geometry[0], beam): list(images)}
 
+    def requirements(self, bench: Bench) -> Sequence[Requirement]:
+        """Return what the flight of the first trial requires, see `flight_requirements`."""
+        if bench.recording is not None:
+            path, beam = AntennaPath.recorded(bench.recording.aux), None
+            return flight_requirements(bench.radar, path, path, beam)
+        world = bench.world()
+        draws = bench.draws(bench.system.address, range(1))
+        return flight_requirements(bench.radar, *flown_paths(bench.radar, world.of(), world.pulses, draws), world.beam)
+
     def choices(self, bench: Bench) -> Sequence[Choice]:
         stage = last_image(bench.chains["recommended"].stages.values())
         if stage is None:
@@ -428,6 +437,68 @@ class AnyPath(System):
         every = [*compensated, *alternatives, Alternative("direct sum", {"stage": "direct_image"}, {})]
         measured = partial(_measured, bench, geometry, {**straight, **tiles}, stage)
         return [Choice("image", "stage", every, measured)]
+
+
+def flight_requirements(
+    radar: InverseRadar, true: AntennaPath, recorded: AntennaPath, beam: SideBeam | None
+) -> list[Requirement]:
+    """Return what simplifications neglect over a flight, seen from the origin.
+
+    Phases are the largest within an aperture, without constant and linear terms, which shift the
+    image: that of the record, or of the time in which a beam sees a point.
+
+    Args:
+        radar: Carrier and pulse rate.
+        true: True path; of several trials the first.
+        recorded: Path that navigation records.
+        beam: Beam of the antenna; None if the scene is always lit.
+
+    Returns:
+        Rows for a straight path, for the recorded one, for its speed, and for an antenna at rest
+        while an echo is on its way.
+    """
+    held = [path.of_trial((0,) * len(path.trials)) for path in (true, recorded)]
+    place, known = (path.places[-1].detach().cpu() for path in held)
+    time = torch.arange(len(place), dtype=torch.float64) / radar.prf_hz
+    basis = torch.stack([torch.ones_like(time), time], -1)
+    start, velocity = torch.linalg.lstsq(basis, place).solution
+    speed = float(velocity.norm())
+    heading = velocity / max(speed, 1e-12)
+    away = -(start + time.mean() * velocity)
+    away = away - (away @ heading) * heading
+    range_m = float(away.norm())
+    sight = away / max(range_m, 1e-12)
+    count = len(time)
+    if beam is not None and speed > 0:
+        width = math.radians(float(torch.as_tensor(beam.width_deg).max()))
+        count = min(count, max(8, round(2 * range_m * math.tan(width / 2) / speed * radar.prf_hz)))
+    dwell_s = count / radar.prf_hz
+
+    def left_m(distance: Tensor) -> float:
+        """Largest distance within an aperture without its straight line."""
+        parts = distance.unfold(0, count, max(1, count // 2))
+        line = basis[:count]
+        return float((parts.mT - line @ torch.linalg.lstsq(line, parts.mT).solution).abs().max())
+
+    bent, error = (left_m(x @ sight) for x in (place - basis @ torch.stack([start, velocity]), known - place))
+    distance = place.norm(dim=-1)
+    moved = left_m(torch.gradient(distance, spacing=(time,))[0] * distance / LIGHT_M_S)
+    # the phase pi / 4 at the ends of the aperture, 4 pi / lambda v dv (T / 2)^2 / R
+    tolerated = radar.wavelength_m * range_m / (4 * speed * dwell_s**2) if speed > 0 else math.inf
+    off = abs(float(torch.linalg.lstsq(basis, known - place).solution[1] @ heading))
+    turn, quarter = 4 * math.pi / radar.wavelength_m, math.pi / 4
+    remedy = "autofocus (path_autofocus, strip_autofocus), which finds errors that change slowly over the aperture"
+    rows = (
+        ("a straight path", f"deviations of {bent:.3g} m from a straight line", bent, "image along the recorded path"),
+        ("the recorded path", f"errors of navigation of {error:.3g} m", error, remedy),
+        ("an antenna at rest during an echo", f"motion while an echo is on its way, {moved:.3g} m", moved, "move it"),
+    )
+    found = [
+        Requirement(name, f"{what} within {dwell_s:.3g} s", turn * x, x / radar.range_step_m, quarter, advice)
+        for name, what, x, advice in rows
+    ]
+    neglects = f"an error of {off:.3g} m/s; {tolerated:.3g} m/s leave a phase of pi / 4 at the ends of {dwell_s:.3g} s"
+    return [*found, Requirement("the recorded speed", neglects, quarter * off / tolerated, math.nan, quarter, remedy)]
 
 
 def _band_limit(radar: InverseRadar, antennas: AntennaPath, beam: SideBeam) -> Limit:
