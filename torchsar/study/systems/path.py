@@ -273,6 +273,31 @@ def _paths(result: Result) -> Drawn:
     yield "paths", "Paths", caption, plot.panels(parts)
 
 
+def _geometry(result: Result) -> Drawn:
+    """Draw the paths of the antennas and the imaged area from above, with the line of sight."""
+    stage = last_image(result.bench.chains["recommended"].stages.values())
+    aux = result.first.trials.recording.aux
+    if stage is None or "transmitter_m" not in aux:
+        return
+    antennas = AntennaPath.recorded(aux)
+    antennas = antennas.of_trial((0,) * len(antennas.trials))
+    names = (
+        ("path of the transmitter", "path of the receiver") if len(antennas.places) > 1 else ("path of the antenna",)
+    )
+    ends = (slice(None, None, max(1, n - 1)) for n in stage.grid.counts)
+    corners = plot.array(stage.grid.pixels_m(*ends)[..., :2].reshape(-1, 2))
+    ring = corners[[0, 1, 3, 2, 0]] if len(corners) == 4 else corners
+    flown = {name: plot.array(place[:, :2]) for name, place in zip(names, antennas.places, strict=True)}
+    sight = np.stack([flown[names[0]].mean(0), corners.mean(0)])
+    lines = {**flown, "imaged area": ring, "line of sight": sight}
+    series = {name: (line[:, 0], line[:, 1]) for name, line in lines.items()}
+    caption = (
+        "The first trial from above: paths, the imaged area of the recommended method, and the mean line of sight."
+    )
+    part = {"series": series, "xlabel": "x (m)", "ylabel": "y (m)", "title": "geometry from above"}
+    yield "geometry", "Geometry from above", caption, plot.panels([part])
+
+
 class AnyPath(System):
     """Antennas on any path."""
 
@@ -321,7 +346,7 @@ class AnyPath(System):
         "pslr_range_db": Column("PSLR in range", "dB"),
     }
 
-    draw_case = (_images, _paths)
+    draw_case = (_images, _geometry, _paths)
     read = staticmethod(read_history)  # pyright: ignore[reportAssignmentType]
 
     def context(self, recording: Recording) -> dict[str, Any]:
