@@ -341,9 +341,9 @@ class TileImage(PathImage):
         height_m: Height z of the imaged plane in metres.
         window: "none", "hann" or "range", see `PathImage`.
         error_db: Largest rms error relative to the image of white noise, in dB.
-        beam_deg: Width of the processed beam in degrees, for strips: the pulses that see the middle
-            of a tile within it are summed for the tile, with the weights of its smooth edges. None
-            for all pulses.
+        beam_deg: Width of the processed beam in degrees, for strips: each pixel is summed over the
+            pulses that see it within the beam, with the weights of its smooth edges. None for all
+            pulses.
         squint_deg: Angle of the middle of the beam ahead of broadside in degrees.
 
     Raises:

@@ -100,12 +100,12 @@ class TilePlan:
         error_db: Largest rms error relative to the image of a history of white noise, in dB.
         lit: For a beam that lights a part of the image at a time: function of positions in metres,
             float64 (point, 3), that returns the first pulse that lights each point and the pulse
-            after the last, int64 (point, 2), alike if there are none. All pixels of a tile are
-            summed over the pulses that light its middle, or if there are none, over those of the
-            point of a lattice in it that most pulses light. None for all pulses.
-        weight: Function of positions that returns the weights of all pulses in the sum, finite,
-            float64 (point, pulse), such as those of a beam with smooth edges; those at the same
-            point are used for all pixels of a tile. None for equal ones.
+            after the last, int64 (point, 2), alike if there are none. Each pixel is the sum over
+            the pulses that light it. None for all pulses.
+        weight: Function of positions that returns the weights of all pulses in the sum of a pixel,
+            finite, float64 (point, pulse), such as those of a beam with smooth edges. Within a tile
+            they are interpolated, as exactly as wanted; the faster they change, the longer an image
+            takes, longest with the hard edges of `lit` alone. None for equal ones.
 
     Raises:
         TypeError: If frequencies or positions are not float64.
@@ -169,12 +169,8 @@ class TilePlan:
             i, j = (torch.arange(s.start, s.stop, device=grid.origin_m.device) for s in block)
             self._numbers.append((i[:, None] * self._tiles[1] + j).reshape(-1))
             centre = tile_centres(grid, *size, i, j, self._height_m)
-            if self.lit is not None:
-                _, ends = scene.seen_from(centre, *size)
-                ends = ends[ends[:, 1] > ends[:, 0]]
-                pulses = (int(ends[:, 0].min()), int(ends[:, 1].max())) if len(ends) else (0, 0)
             bounds = part_bounds(*pulses, choice.parts)
-            given = nominal, every, centre, grid, relief, partial(scene.shares, width=size[0], depth=size[1])
+            given = nominal, every, centre, grid, relief, scene.weights if scene.weighted else None
             self._zones.append([Part(self._band, choice, ends, *given) for ends in bounds])
         parts = [part for zone in self._zones for part in zone]
         self._table_count = sum(part.table_count for part in parts)
@@ -279,13 +275,10 @@ class TilePlan:
         at = ((pixels_m - grid.origin_m) @ grid.axes.mT / grid.step_m).round().long()
         if bool(((at < 0) | (at >= at.new_tensor(grid.counts))).any()):
             raise ValueError("pixels_m must be positions of pixels of the grid of the plan, got some outside of it")
-        i, j = (torch.arange(n, device=at.device) for n in self._tiles)
-        centres = tile_centres(grid, *self._size, i, j, self._height_m)
-        tiles, of = torch.unique(at[:, 0] // self._size[0] * len(j) + at[:, 1] // self._size[1], return_inverse=True)
-        shares = self._scene.shares(centres[tiles], *self._size)
+        weights = self._scene.weights(pixels_m).mT if self._scene.weighted else None
 
         def path(pulses: slice, some: slice) -> tuple[Tensor, Tensor | None]:
-            weight = None if shares is None else shares[of[some], pulses].mT
+            weight = None if weights is None else weights[pulses, some]
             return self.antennas.path_m(pixels_m[some], pulses), weight
 
         return direct_sum(history, self.frequency_hz, path, len(pixels_m), eps=eps)
@@ -355,18 +348,22 @@ class TilePlan:
         for part, matrices in zip(zone, across, strict=True):
             x = profiles[:, part.pulses]
             step = max(1, block_bytes_of(x.device) // (part.samples * x[..., 0].numel() * x.element_size()))
-            height = paths * part.nodes
-            nodes = x.real.new_zeros((rows.stop - rows.start) * height, trials * part.length * 2)
+            height = paths * part.rows
+            nodes = x.real.new_zeros(
+                part.choice.points[1], (rows.stop - rows.start) * height, trials * part.length * 2
+            )
             for i in range(rows.start, rows.stop, step):
                 some = slice(i, min(i + step, rows.stop))
                 where = slice((some.start - rows.start) * height, (some.stop - rows.start) * height)
-                part.add_nodes(nodes[where], x, self._tables_of(part, some, dtype))
+                part.add_nodes(nodes[:, where], x, self._tables_of(part, some, dtype))
             if height_m is not None and height_m.requires_grad:
                 weights = part.weights(rows, dtype, height_m)
             else:
                 weights = self._weights_of((part, rows.start, rows.stop), dtype, part.weights, rows, dtype, height_m)
-            image = part.pixels_of(nodes, matrices, weights)
-            total = image if total is None else total + image
+            for one, along in zip(nodes, part.of_y.mT.to(x.real.dtype), strict=True):
+                image = part.pixels_of(one, matrices, weights)
+                image = image if len(nodes) == 1 else image * along
+                total = image if total is None else total + image
         assert total is not None
         return total
 
