@@ -245,4 +245,5 @@ def interpolation(wanted: Tensor, known: int) -> tuple[Tensor, Tensor]:
     # sum over Chebyshev polynomials, which are orthogonal at these points
     at = torch.arccos(((wanted - middle) / half).clamp(-1, 1))
     share = torch.where(number > 0, 2 / known, 1 / known)
-    return middle + half * torch.cos(angle), torch.cos(at[:, None] * number) * share @ torch.cos(angle * number[:, None])
+    matrix = (torch.cos(at[:, None] * number) * share) @ torch.cos(angle * number[:, None])
+    return middle + half * torch.cos(angle), matrix

@@ -121,7 +121,7 @@ class Part:
         centre: Tensor,
         grid: ImageGrid,
         relief_m: float = 0.0,
-        shares: Callable[[Tensor], Tensor | None] | None = None,
+        shares: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
         axes, self.relief_m, self.shares = grid.axes, relief_m, shares
         self.band, self.choice, self.centre, self.axes = band, choice, centre, axes
@@ -300,8 +300,8 @@ class Part:
         """Add the windows of the pulses to the nodes of some tiles.
 
         Args:
-            nodes: Sums at the nodes, real (point along y, tile * path * point along x * node, trial *
-                wave number * 2); changed in place.
+            nodes: Sums at the nodes, real (point along y, tile * path * point along x * node,
+                trial * wave number * 2); changed in place.
             profiles: Range profiles, extended circularly, complex (path, pulse, trial, sample).
             tables: Tables of the tiles.
         """

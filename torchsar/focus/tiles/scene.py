@@ -107,6 +107,52 @@ def tile_centres(
     return centre.reshape(-1, 3)
 
 
+def lit_pulses(points: Tensor, pulses: int, lit: Lit | None) -> Tensor:
+    """Find the pulses that light points.
+
+    Args:
+        points: Positions in metres, float64 (..., 3).
+        pulses: Number of pulses.
+        lit: Function of positions, see `Scene`; None for all pulses.
+
+    Returns:
+        First pulse that lights each point and the pulse after the last, int64 (..., 2).
+    """
+    if lit is None:
+        return torch.tensor([0, pulses]).expand(*points.shape[:-1], 2)
+    flat = points.reshape(-1, 3)
+    found = lit(flat)
+    _refuse_other("lit", found, torch.int64, (len(flat), 2))
+    return found.cpu().clamp(0, pulses).view(*points.shape[:-1], 2)
+
+
+def pulse_weights(points: Tensor, pulses: int, lit: Lit | None, weight: Weight | None) -> Tensor:
+    """Compute the weights of pulses in the sums at points.
+
+    Args:
+        points: Positions in metres, float64 (..., 3).
+        pulses: Number of pulses.
+        lit: Function of positions, see `Scene`; None for all pulses.
+        weight: Function of positions, see `Scene`; None for equal weights.
+
+    Returns:
+        Weights, zero where a pulse does not light a point, float64 (..., pulse).
+
+    Raises:
+        ValueError: If a function returns another shape or type, or a weight is not finite.
+    """
+    flat, number = points.reshape(-1, 3), torch.arange(pulses, device=points.device)
+    first, last = lit_pulses(flat, pulses, lit).to(points.device)[..., None].unbind(-2)
+    found = ((first <= number) & (number < last)).to(torch.float64)
+    if weight is not None:
+        own = weight(flat)
+        _refuse_other("weight", own, torch.float64, (len(flat), pulses))
+        if not host_value(torch.isfinite(own).all(), True):
+            raise ValueError("weight must return finite weights of pulses, got NaN or Inf; give 0 where none counts")
+        found = found * own
+    return found.view(*points.shape[:-1], -1)
+
+
 @dataclass(frozen=True, eq=False)
 class Sampled:
     """What the errors of sizes depend on, from a sample of tiles and pulses.
@@ -221,13 +267,7 @@ class Scene:
 
     def lit_pulses(self, points: Tensor) -> Tensor:
         """First pulse that lights each point (..., 3), and the pulse after the last, (..., 2)."""
-        pulses = len(self.places[0])
-        if self.lit is None:
-            return torch.tensor([0, pulses]).expand(*points.shape[:-1], 2)
-        flat = points.reshape(-1, 3)
-        found = self.lit(flat)
-        _refuse_other("lit", found, torch.int64, (len(flat), 2))
-        return found.cpu().clamp(0, pulses).view(*points.shape[:-1], 2)
+        return lit_pulses(points, len(self.places[0]), self.lit)
 
     @property
     def weighted(self) -> bool:
@@ -235,21 +275,8 @@ class Scene:
         return self.lit is not None or self.weight is not None
 
     def weights(self, points: Tensor) -> Tensor:
-        """Weights of all pulses in the sums at points (..., 3), float64 (..., pulse), zero where a
-        pulse does not light a point.
-        """
-        flat, number = points.reshape(-1, 3), torch.arange(len(self.places[0]), device=points.device)
-        first, last = self.lit_pulses(flat).to(points.device)[..., None].unbind(-2)
-        found = ((first <= number) & (number < last)).to(torch.float64)
-        if self.weight is not None:
-            weight = self.weight(flat)
-            _refuse_other("weight", weight, torch.float64, (len(flat), len(number)))
-            if not host_value(torch.isfinite(weight).all(), True):
-                raise ValueError(
-                    "weight must return finite weights of pulses, got NaN or Inf; give 0 where none counts"
-                )
-            found = found * weight
-        return found.view(*points.shape[:-1], -1)
+        """Weights of all pulses in the sums at points, see `pulse_weights`."""
+        return pulse_weights(points, len(self.places[0]), self.lit, self.weight)
 
     def _some_tiles(self, *sizes: int) -> Tensor:
         """Middles of some tiles of a size that contain lit pixels, float64 (tile, 3)."""
@@ -307,8 +334,8 @@ class Scene:
         return size, 0.0
 
     def raised_error(self, width: int, depth: int) -> float:
-        """Rms error of weights due to the heights of pixels above the middle of their tile, relative
-        to their rms.
+        """Rms error of weights, relative to their rms, due to the heights of pixels above the middle
+        of their tile.
         """
         relief = self.relief(width, depth)[1]
         if not (relief and self.weighted):
