@@ -17,7 +17,7 @@ from torch import Tensor
 from tests.focus.geometries import C128, F64, C, Case, case
 from tests.helpers import assert_forward_equals_backward
 from torchsar.focus import ImageGrid, ProcessedBeam, TilePlan, backproject, image_tiles
-from torchsar.focus.tiles import plan as of_plan
+from torchsar.focus.tiles import sector as of_plan
 from torchsar.focus.tiles.scene import _pixel_rule
 from torchsar.radar import LIGHT_M_S
 
@@ -358,6 +358,77 @@ def test_a_plan_of_a_long_strip_keeps_no_more_than_its_limits(monkeypatch: pytes
         sizes.append(file.tell() / 2**20)
     assert max(sizes) < 2 * limit + 1
     assert min(sizes[:2]) >= limit and sizes[2] < 1
+
+
+def about_a_scene(turns: float, pulses: int, raised_m: float = 0.0) -> Case:
+    """White noise of turns of radius 300 m about 32 x 40 pixels."""
+    angle = torch.linspace(0, 2 * math.pi * turns, pulses, dtype=F64) + 0.3
+    height = torch.linspace(150, 150 + raised_m, pulses, dtype=F64)
+    place = torch.stack([300 * torch.cos(angle), 300 * torch.sin(angle), height], -1)
+    grid = ImageGrid(torch.tensor([-1.6, -2.0, 0.0]), torch.eye(3)[:2], (32, 40), 0.1)
+    frequency = 9.6e9 + 16e6 * torch.arange(32, dtype=F64)
+    noise = torch.randn(pulses, 32, dtype=C128, generator=torch.Generator().manual_seed(3))
+    return Case(frequency, place, None, 2 * torch.linalg.vector_norm(place, dim=-1), grid, noise)
+
+
+@pytest.mark.parametrize(
+    ("turns", "raised_m", "bistatic"), [(1.0, 0.0, False), (-0.4, 0.0, False), (-0.4, 0.0, True), (1.5, 60.0, False)]
+)
+def test_a_path_about_the_scene_keeps_the_error(turns: float, raised_m: float, bistatic: bool) -> None:
+    drawn = about_a_scene(turns, round(720 * abs(turns)), raised_m)
+    if bistatic:
+        receiver = torch.tensor([[40.0, -500.0, 300.0]], dtype=F64).expand_as(drawn.transmitter_m)
+        reference = drawn.reference_m / 2 + torch.linalg.vector_norm(receiver, dim=-1)
+        drawn = replace(drawn, receiver_m=receiver, reference_m=reference)
+    plan = drawn.plan(-60.0)
+    assert len(plan.sectors) > 2 * abs(turns)
+    assert drawn.error_db(plan.image(drawn.history)) < -57
+    some = drawn.grid.pixels_m().reshape(-1, 3)[::37]
+    truth = drawn.direct(some)
+    assert float((plan.exact(drawn.history, some) - truth).norm() / truth.norm()) < 1e-7
+    moved = replace(drawn, transmitter_m=drawn.transmitter_m + 1e-4)
+    image = plan.moved(moved.transmitter_m, moved.receiver_m, moved.reference_m).image(moved.history)
+    assert moved.error_db(image) < -57
+
+
+def pointed(place: Tensor, points: Tensor, width: float, looks: Tensor | float = 0.0) -> Tensor:
+    """Gaussian pattern over the sine of the angle ahead of broadside, less that of each look."""
+    away = points[:, None] - place
+    return torch.exp(-((away[..., 0] / torch.linalg.vector_norm(away, dim=-1) - looks) / width).square())
+
+
+@pytest.mark.parametrize(
+    ("kind", "wanted"),
+    [("beam", -45.0), ("beam", -80.0), ("squint", -80.0), ("pointing", -60.0), ("gaps", -60.0), ("hills", -45.0)]
+    + [("circle", -60.0)],
+)
+def test_the_promised_error_holds_with_weights_of_each_pixel(kind: str, wanted: float) -> None:
+    squint = 20.0 if kind == "squint" else 0.0
+    drawn = about_a_scene(1.0, 720) if kind == "circle" else beside_a_track(600, (60, 30), squint, None)
+    place, lit, pulses = drawn.transmitter_m, None, len(drawn.transmitter_m)
+    if kind in ("beam", "squint", "gaps", "hills"):
+        beam = ProcessedBeam(3.0, squint)
+        lit, weight = partial(beam.lit_pulses, place), partial(beam.pulse_weights, place)
+    if kind == "pointing":
+        weight = partial(pointed, place, width=0.02, looks=0.05 * torch.sin(torch.arange(pulses, dtype=F64) / 100))
+    elif kind == "gaps":
+        kept = (torch.rand(pulses, generator=torch.Generator().manual_seed(2)) > 0.2).to(F64)
+        weight = lambda points: beam.pulse_weights(place, points) * kept  # noqa: E731
+    elif kind == "hills":
+        hills = 4 * torch.sin(torch.arange(60, dtype=F64) / 20)[:, None] * torch.ones(30, dtype=F64)
+        drawn = replace(drawn, grid=replace(drawn.grid, height_m=hills))
+    elif kind == "circle":
+        weight = partial(pointed, place, width=0.01, looks=-place[:, 0] / place.norm(dim=-1))
+    given = drawn.frequency_hz, place, None, drawn.reference_m, drawn.grid
+    plan = TilePlan(*given, wanted, lit, weight)
+    some = drawn.grid.pixels_m().reshape(-1, 3)[::17]
+    shares = weight(some)
+    waves = torch.linalg.vector_norm(some[:, None] - place, dim=-1) * 2 - drawn.reference_m
+    turns = waves[..., None] * drawn.frequency_hz / LIGHT_M_S
+    truth = (drawn.history * shares[..., None] * torch.exp(2j * math.pi * turns)).sum((-2, -1))
+    assert float((plan.exact(drawn.history, some) - truth).norm() / truth.norm()) < 1e-7
+    found = plan.image(drawn.history).flatten()[::17]
+    assert float((found - truth).norm() / truth.norm()) < 10 ** ((wanted + 3) / 20)
 
 
 def test_pixels_that_no_pulse_lights_are_zero() -> None:

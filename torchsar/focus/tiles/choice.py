@@ -182,9 +182,7 @@ def _sizes(scene: Scene, error_db: float) -> list[tuple[int, int, int, int]]:
     s = a * (b[:, len(some[0]) // 2, None] / b)
     turns = float((s.amax(-1) - s.amin(-1)).max()) * high * grid.step_m * CROSS_OVERSAMPLING / (2 * math.pi)
     pulses = last - first
-    # sub-apertures have at least 8 pulses: with fewer, the nodes that the kernel adds at either end
-    # outnumber them
-    numbers = [2**k for k in range(int(math.log2(max(1, pulses // 8))) + 1)]
+    numbers = [2**k for k in range(int(math.log2(max(1, pulses // 2))) + 1)]
     widths, depths = (
         [size for size in sizes if size < 2 * n or size == sizes[0]]
         for sizes, n in zip(((8, 16, 32, 64, 128), (4, 8, 16, 32, 64, 128)), grid.counts, strict=True)

@@ -334,7 +334,7 @@ class Scene:
         return size, 0.0
 
     def raised_error(self, width: int, depth: int) -> float:
-        """Rms error of weights, relative to their rms, due to the heights of pixels above the middle
+        """Rms error of weights, relative to their rms, due to heights of pixels above the middle
         of their tile.
         """
         relief = self.relief(width, depth)[1]
