@@ -79,6 +79,37 @@ def test_tiles_sum_the_pulses_that_see_them_within_the_beam() -> None:
     assert stage(signal(history), **values(**both)).data.shape == (2, 11, 11)
 
 
+@pytest.mark.parametrize("step_m", [0.06, 0.15, 0.2])
+def test_a_prf_below_the_band_of_the_beam_has_ghosts_of_the_predicted_level_and_place(step_m: float) -> None:
+    beam = ProcessedBeam(5.0)
+    y = torch.arange(-30.0, 30.0, step_m, dtype=torch.float64)
+    place = torch.stack([torch.full_like(y, -300.0), y, torch.full_like(y, 100.0)], -1)
+    reference, frequency = 2 * place.norm(dim=-1), 12e9 + 8e6 * torch.arange(-16, 16, dtype=torch.float64)
+    stage = TileImage(64.0, 1.0, 0.1, window="range", beam_deg=5.0, error_db=-45.0)
+    (limit,) = stage.pulse_limits(AntennaPath(place, None, reference), frequency)
+    assert limit.ok == (step_m < LIGHT_M_S / (2 * frequency[-1] * 2 * math.sin(math.radians(2.5))))
+    # a point at the origin, whose phases are those of the reference, seen within the beam
+    weight = beam.pulse_weights(place, torch.zeros(1, 3, dtype=torch.float64))[0]
+    history = weight[:, None] * torch.ones(len(frequency), dtype=torch.complex128)
+    radar = InverseRadar(12e9, 256e6, 100.0)
+    recorded = Signal(range_profiles(history), radar.raw_axes(len(y), len(frequency)))
+    image = stage(recorded, frequency_hz=frequency, transmitter_m=place, path_reference_m=reference, receiver_m=None)
+    level = 20 * torch.log10(image.data.abs().amax(-1) / image.data.abs().max())
+    away = image.axes[0].values().abs()
+    ghost = torch.where(away > 8, level, -math.inf)
+    if limit.ok:
+        assert float(ghost.max()) < -25
+        return
+    said = [
+        float(word)
+        for word in limit.consequence.replace("m", "").split()
+        if word.replace("-", "").replace(".", "").isdigit()
+    ]
+    assert float(ghost.max()) == pytest.approx(said[1], abs=1.5) and float(away[ghost.argmax()]) == pytest.approx(
+        said[0], abs=0.5
+    )
+
+
 def test_samples_must_hold_the_spectrum_of_a_point() -> None:
     """Beside a straight track: the Doppler band of the beam, and the range band on the ground."""
     y = 0.4 * torch.arange(-300.0, 300.0, dtype=torch.float64)
