@@ -233,7 +233,7 @@ class PathImage(Stage):
         for side in (-1, 1):
             both = lit * beam.weight(sine + side * apart)
             off = cells * (sine - (both * sine).sum() / both.sum().clamp_min(1e-300))
-            held = torch.sinc(off) if self.windows[1] == "none" else hann_response(off)
+            held = torch.sinc(off) if self.windows[1] == "none" else _hann_response(off)
             shares.append((both * held).sum().abs())
         level = float(torch.stack(shares).max() / (lit * weight).sum())
         place = closest * apart / (1 - beam.middle**2) ** 1.5
@@ -329,12 +329,8 @@ def spatial_band(
     return low, high
 
 
-def hann_response(cells: Tensor) -> Tensor:
-    """Response of a band with a Hann window at distances in cells, relative to its peak.
-
-    Args:
-        cells: Distances in units of the inverse bandwidth, any shape.
-    """
+def _hann_response(cells: Tensor) -> Tensor:
+    """Response of a band with a Hann window at distances in cells, relative to its peak."""
     return torch.sinc(cells) + (torch.sinc(cells - 1) + torch.sinc(cells + 1)) / 2
 
 
