@@ -64,16 +64,50 @@ def test_tiles_sum_the_pulses_that_see_them_within_the_beam() -> None:
     wide = y.abs() <= 466 * math.tan(math.radians(3.3)) + 5.0
     parts = [stage(signal(history * some[:, None]), **values(**path)).data for some in (wide, wide | ~wide)]
     torch.testing.assert_close(*parts)
-    # weights follow from the angle to the straight track at the middle of the image
+    # weights follow from the angle to the straight track at each pixel
     one, track = TileImage(0.4, 0.4, STEP_M, window="range", error_db=-80.0, beam_deg=6.0), StraightTrack.fitted(place)
-    middle = one.grid.pixels_m().reshape(-1, 3).mean(0)
-    ahead = track.along_m(middle) - track.along_m(place)
-    offset = torch.sin(torch.atan2(ahead, torch.linalg.vector_norm(track.across_m(middle)))) / math.sin(math.radians(3))
-    edge = 0.5 * (1 + torch.cos(math.pi * ((offset.abs() - 0.9) / 0.2).clamp(0, 1)))
-    exact = DirectImage(0.4, 0.4, STEP_M, window="range")(signal(history * edge[:, None]), **values(**path)).data
-    assert float(error_db(one(signal(history), **values(**path)).data, exact)) < -75
+    pixels, exact = one.grid.pixels_m().reshape(-1, 3), []
+    for i, pixel in enumerate(pixels):
+        ahead = track.along_m(pixel) - track.along_m(place)
+        offset = torch.sin(torch.atan2(ahead, track.across_m(pixel).norm())) / math.sin(math.radians(3))
+        edge = 0.5 * (1 + torch.cos(math.pi * ((offset.abs() - 0.9) / 0.2).clamp(0, 1)))
+        direct = DirectImage(0.4, 0.4, STEP_M, window="range")(signal(history * edge[:, None]), **values(**path))
+        exact.append(direct.data.flatten()[i])
+    found = one(signal(history), **values(**path)).data.flatten()
+    assert float(error_db(found[None], torch.stack(exact)[None])) < -75
     both = {**path, "transmitter_m": torch.stack([place, place + 0.01])}
     assert stage(signal(history), **values(**both)).data.shape == (2, 11, 11)
+
+
+@pytest.mark.parametrize("step_m", [0.06, 0.15, 0.2])
+def test_a_prf_below_the_band_of_the_beam_has_ghosts_of_the_predicted_level_and_place(step_m: float) -> None:
+    beam = ProcessedBeam(5.0)
+    y = torch.arange(-30.0, 30.0, step_m, dtype=torch.float64)
+    place = torch.stack([torch.full_like(y, -300.0), y, torch.full_like(y, 100.0)], -1)
+    reference, frequency = 2 * place.norm(dim=-1), 12e9 + 8e6 * torch.arange(-16, 16, dtype=torch.float64)
+    stage = TileImage(64.0, 1.0, 0.1, window="range", beam_deg=5.0, error_db=-45.0)
+    (limit,) = stage.pulse_limits(AntennaPath(place, None, reference), frequency)
+    assert limit.ok == (step_m < LIGHT_M_S / (2 * frequency[-1] * 2 * math.sin(math.radians(2.5))))
+    # a point at the origin, whose phases are those of the reference, seen within the beam
+    weight = beam.pulse_weights(place, torch.zeros(1, 3, dtype=torch.float64))[0]
+    history = weight[:, None] * torch.ones(len(frequency), dtype=torch.complex128)
+    radar = InverseRadar(12e9, 256e6, 100.0)
+    recorded = Signal(range_profiles(history), radar.raw_axes(len(y), len(frequency)))
+    image = stage(recorded, frequency_hz=frequency, transmitter_m=place, path_reference_m=reference, receiver_m=None)
+    level = 20 * torch.log10(image.data.abs().amax(-1) / image.data.abs().max())
+    away = image.axes[0].values().abs()
+    ghost = torch.where(away > 8, level, -math.inf)
+    if limit.ok:
+        assert float(ghost.max()) < -25
+        return
+    said = [
+        float(word)
+        for word in limit.consequence.replace("m", "").split()
+        if word.replace("-", "").replace(".", "").isdigit()
+    ]
+    assert float(ghost.max()) == pytest.approx(said[1], abs=1.5) and float(away[ghost.argmax()]) == pytest.approx(
+        said[0], abs=0.5
+    )
 
 
 def test_samples_must_hold_the_spectrum_of_a_point() -> None:

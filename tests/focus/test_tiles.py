@@ -17,7 +17,7 @@ from torch import Tensor
 from tests.focus.geometries import C128, F64, C, Case, case
 from tests.helpers import assert_forward_equals_backward
 from torchsar.focus import ImageGrid, ProcessedBeam, TilePlan, backproject, image_tiles
-from torchsar.focus.tiles import plan as of_plan
+from torchsar.focus.tiles import sector as of_plan
 from torchsar.focus.tiles.scene import _pixel_rule
 from torchsar.radar import LIGHT_M_S
 
@@ -214,7 +214,7 @@ def test_a_bent_path_keeps_the_error(seed: int, size: float) -> None:
     moved = replace(drawn, transmitter_m=drawn.transmitter_m + shift)
     following = plan.moved(moved.transmitter_m, moved.receiver_m, moved.reference_m)
     assert moved.error_db(following.image(moved.history)) < -67
-    assert size > 1e-4 or following._zones is plan._zones
+    assert size > 1e-4 or following.sectors[0]._zones is plan.sectors[0]._zones
     assert following.choice.error_db < -68
 
 
@@ -309,7 +309,7 @@ def strip(pulses: int = 400, pixels: int = 400) -> tuple[Case, Callable[[Tensor]
 
 
 @pytest.mark.parametrize("weighted", [False, True])
-def test_a_strip_sums_the_pulses_that_light_the_middle_of_a_tile(weighted: bool) -> None:
+def test_a_strip_sums_the_pulses_that_light_each_pixel(weighted: bool) -> None:
     drawn, lit = strip(pixels=390)
     x = drawn.transmitter_m[:, 0]
 
@@ -319,19 +319,14 @@ def test_a_strip_sums_the_pulses_that_light_the_middle_of_a_tile(weighted: bool)
     given = drawn.frequency_hz, drawn.transmitter_m, None, drawn.reference_m, drawn.grid
     plan = TilePlan(*given, error_db=-70, lit=lit, weight=weight if weighted else None)
     pixels = drawn.grid.pixels_m()
-    # the first axis of the image is across the range
-    width, (rows, columns) = plan.choice.width, drawn.grid.counts
-    first = torch.arange(rows) // width * width
-    middle = (first + (first + width).clamp(max=rows) - 1).to(F64) / 2
-    centres = (drawn.grid.origin_m + drawn.grid.step_m * middle[:, None] * drawn.grid.axes[0])[:, None]
-    centres = centres.expand(rows, columns, 3)
-    assert rows % width and rows > 2 * width
+    rows, columns = drawn.grid.counts
+    assert rows % plan.choice.width and rows > 2 * plan.choice.width
     some = torch.arange(0, rows * columns, 53)
     i, j = some // columns, some % columns
-    number, ends = torch.arange(len(x))[:, None], lit(centres[i, j])
+    number, ends = torch.arange(len(x))[:, None], lit(pixels[i, j])
     shares = ((ends[:, 0] <= number) & (number < ends[:, 1])).to(F64)
     if weighted:
-        shares = shares * weight(centres[i, j]).mT
+        shares = shares * weight(pixels[i, j]).mT
     way = 2 * torch.linalg.vector_norm(pixels[i, j] - drawn.transmitter_m[:, None], dim=-1) - drawn.reference_m[:, None]
     waves = torch.exp(2j * math.pi * drawn.frequency_hz[:, None, None] * way / LIGHT_M_S)
     truth = (drawn.history.mT[..., None] * shares * waves).sum((0, 1))
@@ -353,7 +348,7 @@ def test_a_plan_of_a_long_strip_keeps_no_more_than_its_limits(monkeypatch: pytes
     single precision 18 and 31 MB, in double precision twice as much.
     """
     drawn, _ = strip(pulses=500, pixels=500)
-    monkeypatch.setattr("torchsar.focus.tiles.plan._KEPT_BYTES", limit << 20)
+    monkeypatch.setattr("torchsar.focus.tiles.sector._KEPT_BYTES", limit << 20)
     plan, single = drawn.plan(-40.0), drawn.history.to(torch.complex64)
     sizes = []
     for history in (single, single.expand(2, -1, -1), drawn.history):
@@ -363,6 +358,77 @@ def test_a_plan_of_a_long_strip_keeps_no_more_than_its_limits(monkeypatch: pytes
         sizes.append(file.tell() / 2**20)
     assert max(sizes) < 2 * limit + 1
     assert min(sizes[:2]) >= limit and sizes[2] < 1
+
+
+def about_a_scene(turns: float, pulses: int, raised_m: float = 0.0) -> Case:
+    """White noise of turns of radius 300 m about 32 x 40 pixels."""
+    angle = torch.linspace(0, 2 * math.pi * turns, pulses, dtype=F64) + 0.3
+    height = torch.linspace(150, 150 + raised_m, pulses, dtype=F64)
+    place = torch.stack([300 * torch.cos(angle), 300 * torch.sin(angle), height], -1)
+    grid = ImageGrid(torch.tensor([-1.6, -2.0, 0.0]), torch.eye(3)[:2], (32, 40), 0.1)
+    frequency = 9.6e9 + 16e6 * torch.arange(32, dtype=F64)
+    noise = torch.randn(pulses, 32, dtype=C128, generator=torch.Generator().manual_seed(3))
+    return Case(frequency, place, None, 2 * torch.linalg.vector_norm(place, dim=-1), grid, noise)
+
+
+@pytest.mark.parametrize(
+    ("turns", "raised_m", "bistatic"), [(1.0, 0.0, False), (-0.4, 0.0, False), (-0.4, 0.0, True), (1.5, 60.0, False)]
+)
+def test_a_path_about_the_scene_keeps_the_error(turns: float, raised_m: float, bistatic: bool) -> None:
+    drawn = about_a_scene(turns, round(720 * abs(turns)), raised_m)
+    if bistatic:
+        receiver = torch.tensor([[40.0, -500.0, 300.0]], dtype=F64).expand_as(drawn.transmitter_m)
+        reference = drawn.reference_m / 2 + torch.linalg.vector_norm(receiver, dim=-1)
+        drawn = replace(drawn, receiver_m=receiver, reference_m=reference)
+    plan = drawn.plan(-60.0)
+    assert len(plan.sectors) > 2 * abs(turns)
+    assert drawn.error_db(plan.image(drawn.history)) < -57
+    some = drawn.grid.pixels_m().reshape(-1, 3)[::37]
+    truth = drawn.direct(some)
+    assert float((plan.exact(drawn.history, some) - truth).norm() / truth.norm()) < 1e-7
+    moved = replace(drawn, transmitter_m=drawn.transmitter_m + 1e-4)
+    image = plan.moved(moved.transmitter_m, moved.receiver_m, moved.reference_m).image(moved.history)
+    assert moved.error_db(image) < -57
+
+
+def pointed(place: Tensor, points: Tensor, width: float, looks: Tensor | float = 0.0) -> Tensor:
+    """Gaussian pattern over the sine of the angle ahead of broadside, less that of each look."""
+    away = points[:, None] - place
+    return torch.exp(-((away[..., 0] / torch.linalg.vector_norm(away, dim=-1) - looks) / width).square())
+
+
+@pytest.mark.parametrize(
+    ("kind", "wanted"),
+    [("beam", -45.0), ("beam", -80.0), ("squint", -80.0), ("pointing", -60.0), ("gaps", -60.0), ("hills", -45.0)]
+    + [("circle", -60.0)],
+)
+def test_the_promised_error_holds_with_weights_of_each_pixel(kind: str, wanted: float) -> None:
+    squint = 20.0 if kind == "squint" else 0.0
+    drawn = about_a_scene(1.0, 720) if kind == "circle" else beside_a_track(600, (60, 30), squint, None)
+    place, lit, pulses = drawn.transmitter_m, None, len(drawn.transmitter_m)
+    if kind in ("beam", "squint", "gaps", "hills"):
+        beam = ProcessedBeam(3.0, squint)
+        lit, weight = partial(beam.lit_pulses, place), partial(beam.pulse_weights, place)
+    if kind == "pointing":
+        weight = partial(pointed, place, width=0.02, looks=0.05 * torch.sin(torch.arange(pulses, dtype=F64) / 100))
+    elif kind == "gaps":
+        kept = (torch.rand(pulses, generator=torch.Generator().manual_seed(2)) > 0.2).to(F64)
+        weight = lambda points: beam.pulse_weights(place, points) * kept  # noqa: E731
+    elif kind == "hills":
+        hills = 4 * torch.sin(torch.arange(60, dtype=F64) / 20)[:, None] * torch.ones(30, dtype=F64)
+        drawn = replace(drawn, grid=replace(drawn.grid, height_m=hills))
+    elif kind == "circle":
+        weight = partial(pointed, place, width=0.01, looks=-place[:, 0] / place.norm(dim=-1))
+    given = drawn.frequency_hz, place, None, drawn.reference_m, drawn.grid
+    plan = TilePlan(*given, wanted, lit, weight)
+    some = drawn.grid.pixels_m().reshape(-1, 3)[::17]
+    shares = weight(some)
+    waves = torch.linalg.vector_norm(some[:, None] - place, dim=-1) * 2 - drawn.reference_m
+    turns = waves[..., None] * drawn.frequency_hz / LIGHT_M_S
+    truth = (drawn.history * shares[..., None] * torch.exp(2j * math.pi * turns)).sum((-2, -1))
+    assert float((plan.exact(drawn.history, some) - truth).norm() / truth.norm()) < 1e-7
+    found = plan.image(drawn.history).flatten()[::17]
+    assert float((found - truth).norm() / truth.norm()) < 10 ** ((wanted + 3) / 20)
 
 
 def test_pixels_that_no_pulse_lights_are_zero() -> None:
@@ -382,9 +448,8 @@ def test_pixels_that_no_pulse_lights_are_zero() -> None:
         def weight(points: Tensor, dtype: torch.dtype = dtype) -> Tensor:
             return torch.full((len(points), number), math.nan, dtype=dtype)
 
-        plan = TilePlan(*given, drawn.grid, -60.0, lit, weight)
         with pytest.raises(ValueError, match=match):
-            plan.image(drawn.history)
+            TilePlan(*given, drawn.grid, -60.0, lit, weight)
     plan = TilePlan(*given, drawn.grid, -60.0, lit)
     for pixels, match in (
         (torch.full((1, 3), 900.0, dtype=F64), "outside of it"),
@@ -414,21 +479,19 @@ def test_a_small_lit_part_between_the_corners_and_the_middle_is_found() -> None:
 
 def test_a_tile_whose_middle_is_dark_shows_its_lit_part() -> None:
     drawn, _ = strip(pulses=100)
-    plan = drawn.plan(-60.0)
-    edge = drawn.grid.origin_m[0] + drawn.grid.step_m * 0.3 * plan.choice.width
+    edge = drawn.grid.origin_m[0] + drawn.grid.step_m * 2.5
 
     def lit(points: Tensor) -> Tensor:
         return (points[:, :1] < edge) * torch.tensor([10, 90])
 
     found = TilePlan(drawn.frequency_hz, drawn.transmitter_m, None, drawn.reference_m, drawn.grid, -60.0, lit)
-    size = found.choice.width
-    assert 3 < 0.3 * plan.choice.width < size / 2 - 1
+    assert found.choice.width / 2 - 1 > 2.5
     history = drawn.history.clone()
     history[:10], history[90:] = 0, 0
     truth = replace(drawn, history=history).direct(drawn.grid.pixels_m()[:3].reshape(-1, 3))
     image = found.image(drawn.history)
     # at the edge of a tile errors are larger than in the mean
-    assert float((image[:3].flatten() - truth).norm() / truth.norm()) < 10 ** (-50 / 20) and not image[size:].any()
+    assert float((image[:3].flatten() - truth).norm() / truth.norm()) < 10 ** (-50 / 20) and not image[3:].any()
 
 
 def beside_a_track(pulses: int, counts: tuple[int, int], squint_deg: float, height_m: float | None) -> Case:

@@ -50,6 +50,11 @@ def test_numpy_archives_and_dates(tmp_path: Path) -> None:
         torch.testing.assert_close(track.time_s - track.time_s[0], torch.from_numpy(TIME), rtol=0, atol=1e-6)
 
 
+def test_decimal_commas(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("t;x;y;z\n0;1,5;2;3\n0,5;-1,25;2;3\n")
+    assert read_track(tmp_path / "log.csv").position_m[:, 0].tolist() == [1.5, -1.25]
+
+
 def test_latitudes_become_local_and_records_with_nan_are_named(tmp_path: Path) -> None:
     latitude, longitude, height = 48 + 1e-4 * TIME, 11 + 0 * TIME, 500 + 0 * TIME
     height[[2, 5]] = np.nan

@@ -136,8 +136,8 @@ class MotionCompensation:
         if needed > held:
             raise ValueError(
                 f"pulses {self.track.step_m:.4g} m apart hold {held:.4g} cycles/m along the track, but a processed "
-                f"beam of {beam.width_deg:g} degrees has {needed:.4g} with its edges; choose a narrower beam or image "
-                "it by tiles"
+                f"beam of {beam.width_deg:g} degrees has {needed:.4g} with its edges; raise the PRF, or choose a "
+                "narrower beam"
             )
         sine, share = beam.quadrature()
         self._cosine = float((share * torch.sqrt(1 - sine.square())).sum())

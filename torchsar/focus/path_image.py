@@ -21,6 +21,7 @@ from torchsar.focus.requirements import Limit
 from torchsar.focus.spotlight import window_weights
 from torchsar.focus.tiles import TilePlan
 from torchsar.focus.tiles.scene import Lit, Weight
+from torchsar.radar import StraightTrack
 from torchsar.radar.antenna_path import AntennaPath
 from torchsar.radar.spotlight import frequency_samples
 from torchsar.radar.stripmap import LIGHT_M_S
@@ -190,6 +191,66 @@ class PathImage(Stage):
             for axis, step in zip(self.axes, steps, strict=True)
         ]
 
+    def pulse_limits(
+        self,
+        antennas: AntennaPath,
+        frequency_hz: Tensor,
+        power: Callable[[Tensor], Tensor] | None = None,
+        beam: ProcessedBeam | None = None,
+    ) -> list[Limit]:
+        """Return the limit of the distance of pulses, up to which they hold the Doppler band.
+
+        Beyond it, a point appears again where its Doppler frequency differs by the PRF. The level
+        of such a ghost is the share of the echo in the pulses within whose beam both lie, less what
+        the range window leaves of it: the range of a ghost changes by a wavelength per pulse.
+
+        Args:
+            antennas: Path of the antennas; the receiver has the beam.
+            frequency_hz: Frequencies in Hz, float64 (frequency,).
+            power: Function of the sine of the angle ahead of broadside that returns the two-way
+                power gain of the antenna; None for the squared weights of the beam.
+            beam: Beam of the antenna, which counts where the image has no processed beam.
+
+        Returns:
+            The limit; none without a beam.
+        """
+        beam = self.beam or beam
+        if beam is None:
+            return []
+        track, ways = StraightTrack.fitted(_mean_place(antennas)), 2 if antennas.receiver_m is None else 1
+        wavelength = LIGHT_M_S / float(frequency_hz.max())
+        longest = wavelength / (ways * beam.band)
+        # sine by which the lines of sight to a point and to its ghost differ
+        apart = wavelength / (ways * track.step_m)
+        low, high = beam.ends
+        sine = torch.linspace(low - apart, high + apart, 4096, dtype=torch.float64)
+        weight = beam.weight(sine)
+        lit = weight if power is None else power(sine).sqrt()
+        middle = self.grid.pixels_m(*(slice(n // 2, n // 2 + 1) for n in self.grid.counts)).reshape(-1, 3)
+        closest = float(torch.linalg.vector_norm(track.across_m(middle.to(track.along)), dim=-1))
+        cells = closest / track.step_m * float(frequency_hz.max() - frequency_hz.min()) / float(frequency_hz.mean())
+        shares = []
+        for side in (-1, 1):
+            both = lit * beam.weight(sine + side * apart)
+            off = cells * (sine - (both * sine).sum() / both.sum().clamp_min(1e-300))
+            held = torch.sinc(off) if self.windows[1] == "none" else _hann_response(off)
+            shares.append((both * held).sum().abs())
+        level = float(torch.stack(shares).max() / (lit * weight).sum())
+        place = closest * apart / (1 - beam.middle**2) ** 1.5
+        return [
+            Limit(
+                "the distance of pulses along the track",
+                track.step_m,
+                longest,
+                "m",
+                "warn",
+                f"ghosts of bright points lie {place:.3g} m beside them along the track, at up to "
+                f"{20 * math.log10(max(level, 1e-10)):.1f} dB",
+                f"raise the PRF by a factor of {track.step_m / longest:.3g} or more; a narrower processed beam helps "
+                "only as far as the antenna illuminates no more",
+            )
+        ]
+
     def seen(self, antennas: AntennaPath) -> Tensor:
         """Return the pulses that see a part of the image.
 
@@ -268,6 +329,11 @@ def spatial_band(
     return low, high
 
 
+def _hann_response(cells: Tensor) -> Tensor:
+    """Response of a band with a Hann window at distances in cells, relative to its peak."""
+    return torch.sinc(cells) + (torch.sinc(cells - 1) + torch.sinc(cells + 1)) / 2
+
+
 def _mean_place(antennas: AntennaPath) -> Tensor:
     """Mean positions of the receiver of all trials, float64 (pulse, 3)."""
     return antennas.places[-1].detach().reshape(-1, antennas.pulses, 3).mean(0)
@@ -341,9 +407,9 @@ class TileImage(PathImage):
         height_m: Height z of the imaged plane in metres.
         window: "none", "hann" or "range", see `PathImage`.
         error_db: Largest rms error relative to the image of white noise, in dB.
-        beam_deg: Width of the processed beam in degrees, for strips: the pulses that see the middle
-            of a tile within it are summed for the tile, with the weights of its smooth edges. None
-            for all pulses.
+        beam_deg: Width of the processed beam in degrees, for strips: each pixel is summed over the
+            pulses that see it within the beam, with the weights of its smooth edges. None for all
+            pulses.
         squint_deg: Angle of the middle of the beam ahead of broadside in degrees.
 
     Raises:

@@ -148,10 +148,11 @@ def read_table(path: Path) -> dict[str, np.ndarray]:
         lines = [line.strip() for line in path.read_text("utf-8-sig").splitlines() if line.strip()]
     except UnicodeDecodeError:
         raise ValueError(f"{path} is no table of numbers in text") from None
+    decimal = "," if lines and ";" in lines[-1] else "."  # as tables of some countries have it
     mark = next((mark for mark in (";", ",", "\t") if lines and mark in lines[-1]), None)
     rows, names = [], []
     for number, line in enumerate(lines, 1):
-        cells = [cell.strip().strip('"') for cell in line.lstrip("# ").split(mark)]
+        cells = [cell.strip().strip('"').replace(decimal, ".") for cell in line.lstrip("# ").split(mark)]
         try:
             values = [_value(cell) for cell in cells]
         except ValueError:

@@ -35,18 +35,21 @@ class Choice:
         depth: Pixels of a tile along the range.
         parts: Number of sub-apertures.
         order: Highest power of the range coordinate in the expansion, 1 or 2.
+        points: Numbers of points of a tile across and along the range between which the weights of
+            the pulses are interpolated.
         taps: Width of the kernel over cross range in nodes.
         rise: Samples of either slope of the window over range.
         guard: Share of the band that the slopes of the window may fill.
         oversampling: Fineness of the range profiles relative to the resolution.
         error_db: Predicted error relative to the image of white noise in dB.
-        sampling_error: Part of it that kernel and window cause, relative to 1.
+        sampling_error: Part of it that kernel, window and weights cause, relative to 1.
     """
 
     width: int
     depth: int
     parts: int
     order: int
+    points: tuple[int, int]
     taps: int
     rise: int
     guard: float
@@ -94,7 +97,9 @@ def choose(scene: Scene, error_db: float) -> Choice:
         sampled = scene.sampled(*sizes)
         if sampled.error < wanted and sizes[2] > _FEW_PARTS:
             sampled = scene.sampled(*sizes, dense=True)
-        error = sampled.error
+        numbers, errors = zip(*_points(scene, *sizes[:2], wanted), strict=True)
+        errors = *errors, scene.raised_error(*sizes[:2])
+        error = math.hypot(sampled.error, *errors)
         left = math.sqrt(max(0.0, wanted**2 - error**2))
         turns = scene.node_turns(sizes[0])
         taps = taps_for(0.8 * left, *turns)
@@ -105,15 +110,23 @@ def choose(scene: Scene, error_db: float) -> Choice:
             found = _choose_slope(scene, sampled, math.sqrt(left**2 - kernel**2))
             if found is not None:
                 slope, window = found
-                sampling = math.hypot(kernel, window)
-                return Choice(*sizes, taps, *slope, 20 * math.log10(math.hypot(error, sampling)), sampling)
-        failed.append((sizes, error))
+                sampling = math.hypot(kernel, window, *errors)
+                reached = 20 * math.log10(math.hypot(sampled.error, sampling))
+                return Choice(*sizes, numbers, taps, *slope, reached, sampling)
+        failed.append((sizes, sampled.error))
     reach = f"{20 * math.log10(best):.1f} dB" if best < 1 else "no error below 0 dB"
     raise ValueError(
         f"tiles reach {reach} in this geometry, wanted were {error_db:g} dB; admit more, such as "
         f"error_db={error_db + 20:g}, take a finer spacing of the pixels, turn the axes of the grid to the direction "
         "of the range, or use the direct sum"
     )
+
+
+def _points(scene: Scene, width: int, depth: int, wanted: float) -> list[tuple[int, float]]:
+    """Points of a tile between which weights are interpolated, with the errors that they have: half
+    of the wanted error power at most, a choice.
+    """
+    return [scene.points(axis, size, wanted / 2) for axis, size in enumerate((width, depth))]
 
 
 def _choose_slope(scene: Scene, sampled: Sampled, error: float) -> tuple[tuple[int, float, float], float] | None:
@@ -169,9 +182,7 @@ def _sizes(scene: Scene, error_db: float) -> list[tuple[int, int, int, int]]:
     s = a * (b[:, len(some[0]) // 2, None] / b)
     turns = float((s.amax(-1) - s.amin(-1)).max()) * high * grid.step_m * CROSS_OVERSAMPLING / (2 * math.pi)
     pulses = last - first
-    # sub-apertures have at least 8 pulses: with fewer, the nodes that the kernel adds at either end
-    # outnumber them
-    numbers = [2**k for k in range(int(math.log2(max(1, pulses // 8))) + 1)]
+    numbers = [2**k for k in range(int(math.log2(max(1, pulses // 2))) + 1)]
     widths, depths = (
         [size for size in sizes if size < 2 * n or size == sizes[0]]
         for sizes, n in zip(((8, 16, 32, 64, 128), (4, 8, 16, 32, 64, 128)), grid.counts, strict=True)
@@ -184,11 +195,12 @@ def _sizes(scene: Scene, error_db: float) -> list[tuple[int, int, int, int]]:
         if not 2 * reach + 1 <= 4096:
             continue  # longer windows take too much memory
         length, samples = window_length(reach, rise), 2 * reach + 1 + 2 * rise
+        (across, _), (along, _) = _points(scene, width, depth, 10 ** (error_db / 20))
         tiles = -(-grid.counts[0] // width) * -(-grid.counts[1] // depth)
         for parts, order in itertools.product(numbers, (1, 2)):
             nodes = turns * width / parts + taps + 1
-            flops = 4 * tiles * pulses * (taps + CHUNK * nodes / max(1, pulses / parts)) * length
-            flops += 8 * parts * tiles * length * width * (MOMENTS * nodes + (order + 1) * depth)
+            flops = 4 * tiles * pulses * (taps + CHUNK * nodes / max(1, pulses / parts)) * length * across * along
+            flops += 8 * parts * tiles * length * width * (MOMENTS * nodes * across + (order + 1) * depth) * along
             time = tiles * pulses * (samples + length) * 4.4 + flops * 0.0142
             time += parts * tiles * (length * width * MOMENTS * (order + 1) * 2.1 + 3000)
             found.append((time, (width, depth, parts, order)))

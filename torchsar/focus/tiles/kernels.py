@@ -1,4 +1,6 @@
-"""Window over range and kernel over cross range of the tile imager, with their errors."""
+"""Window over range and kernel over cross range of the tile imager, with their errors, and the
+polynomials between known values.
+"""
 
 from __future__ import annotations
 
@@ -219,3 +221,29 @@ def rise_for(error: float, guard: float, turns: Tensor, away: Tensor, reach: flo
     if guard <= 0:
         return None
     return next((rise for rise in _RISES if window_error(rise, guard, turns, away, reach) <= error), None)
+
+
+def interpolation(wanted: Tensor, known: int) -> tuple[Tensor, Tensor]:
+    """Interpolate a function between as many positions as are known.
+
+    Values at all wanted positions are taken as they are where no more are wanted than known.
+    Otherwise they are those of the polynomial through the values at Chebyshev points.
+
+    Args:
+        wanted: Positions, float64 (wanted,).
+        known: Number of positions at which values are known.
+
+    Returns:
+        These positions, float64 (known,), and the matrix from the values there to those at the
+        positions wanted, (wanted, known).
+    """
+    if known >= len(wanted):
+        return wanted, torch.eye(len(wanted), dtype=wanted.dtype, device=wanted.device)
+    half, middle = (wanted.max() - wanted.min()) / 2, (wanted.max() + wanted.min()) / 2
+    number = torch.arange(known, dtype=wanted.dtype, device=wanted.device)
+    angle = (number + 0.5) * (math.pi / known)
+    # sum over Chebyshev polynomials, which are orthogonal at these points
+    at = torch.arccos(((wanted - middle) / half).clamp(-1, 1))
+    share = torch.where(number > 0, 2 / known, 1 / known)
+    matrix = (torch.cos(at[:, None] * number) * share) @ torch.cos(angle * number[:, None])
+    return middle + half * torch.cos(angle), matrix

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -11,11 +12,18 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchsar.core import linear_solve, outer_phasor, phasor_tables, real_dtype, unit_phasor, untraced
+from torchsar.core import outer_phasor, phasor_tables, real_dtype, unit_phasor, untraced
 from torchsar.focus.image_grid import ImageGrid
 from torchsar.focus.tiles.choice import CHUNK, Choice
 from torchsar.focus.tiles.expansion import MOMENTS, Expansion, curvatures, slopes
-from torchsar.focus.tiles.kernels import CROSS_OVERSAMPLING, node_values, spread_kernel, window_length, window_slope
+from torchsar.focus.tiles.kernels import (
+    CROSS_OVERSAMPLING,
+    interpolation,
+    node_values,
+    spread_kernel,
+    window_length,
+    window_slope,
+)
 from torchsar.focus.tiles.scene import profile_length
 
 # pulses to which the polynomials of a part are fitted, and samples of s for each node to which the
@@ -73,8 +81,10 @@ class Tables:
         first: First sample of each window, shape (tile, path, pulse), int64.
         before: Weights of the samples of a window, complex (tile, path, pulse, sample).
         after: Weights of their spectrum, complex (tile, path, pulse, wave number).
-        spread: Weights of pulses at nodes, real (tile, path, chunk, node of the chunk, pulse).
+        spread: Kernel of pulses at nodes, real (tile, path, chunk, node of the chunk, pulse).
         node: Node of each row of `spread`, (tile, path, chunk, node of the chunk), int64.
+        shares: Weights of the pulses at the points of a tile, real (y, x, tile, chunk, pulse); None
+            if all are one.
     """
 
     first: Tensor
@@ -82,6 +92,7 @@ class Tables:
     after: Tensor
     spread: Tensor
     node: Tensor
+    shares: Tensor | None
 
 
 class Part:
@@ -96,8 +107,8 @@ class Part:
         centre: Centres of the tiles, float64 (tile, 3).
         grid: Pixels, with the second axis nearer to the range direction.
         relief_m: Largest height of a pixel above the plane of its tile in metres.
-        shares: Function of the centres of some tiles, (tile, 3), that returns the weights of all
-            pulses in their sums, (tile, pulse), or None if all are one.
+        shares: Function of positions (..., 3) that returns the weights of all pulses in the sums
+            there, (..., pulse); None if all are one.
     """
 
     def __init__(
@@ -110,7 +121,7 @@ class Part:
         centre: Tensor,
         grid: ImageGrid,
         relief_m: float = 0.0,
-        shares: Callable[[Tensor], Tensor | None] | None = None,
+        shares: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
         axes, self.relief_m, self.shares = grid.axes, relief_m, shares
         self.band, self.choice, self.centre, self.axes = band, choice, centre, axes
@@ -123,6 +134,9 @@ class Part:
             (torch.arange(n, dtype=torch.float64, device=centre.device) - (n - 1) / 2) * grid.step_m
             for n in (choice.width, choice.depth)
         )
+        # points of a tile at which weights are known, and the polynomials between them
+        (x, self.of_x), (y, self.of_y) = map(interpolation, (self.x, self.y), choice.points)
+        self.offset_m = (y[:, None] * axes[1])[:, None] + x[:, None] * axes[0]
         every = [v[:, self.pulses] for v in every]
         low, high = self._extent(every)
         margin = _MARGIN * (high - low) + _LEAST_MARGIN
@@ -161,7 +175,8 @@ class Part:
     def table_count(self) -> int:
         """Largest number of complex values in the tables of all tiles for one path."""
         # positions in the window are whole numbers, weights at nodes real numbers: two make one
-        return len(self.centre) * self.count * (self.samples + self.length + self.nodes // 2 + 1)
+        real = self.nodes + (0 if self.shares is None else math.prod(self.choice.points))
+        return len(self.centre) * self.count * (self.samples + self.length + real // 2 + 1)
 
     @property
     def weight_count(self) -> int:
@@ -170,7 +185,12 @@ class Part:
         of_tile = self.length * powers * (MOMENTS * wide + deep) + wide * deep
         if self.relief_m:
             of_tile += wide * deep * 3 * math.isqrt(self.length)
-        return MOMENTS * self.length * self.nodes * wide + len(self.centre) * of_tile
+        return MOMENTS * self.length * self.rows * wide + len(self.centre) * of_tile
+
+    @property
+    def rows(self) -> int:
+        """Number of nodes of a tile for each of its points along y: those of each point along x."""
+        return self.choice.points[0] * self.nodes
 
     @untraced()
     def across(self, dtype: torch.dtype) -> list[Tensor]:
@@ -180,7 +200,7 @@ class Part:
             dtype: Precision of the history.
 
         Returns:
-            Matrices (wave number, node, x) that all tiles of the part share.
+            Matrices (wave number, point along x * node, x) that all tiles of the part share.
         """
         s = torch.linspace(*self.extent, _FIT_DENSITY * self.nodes, dtype=torch.float64, device=self.centre.device)
         values = node_values((s - self.low) / self.node_step, self.nodes, self.choice.taps) / self.length
@@ -191,7 +211,8 @@ class Part:
         moments = torch.cat([values * s**power for power in range(MOMENTS)])
         found = moments @ torch.view_as_real(phasor).reshape(len(s), -1)
         found = torch.view_as_complex(found.view(MOMENTS, self.nodes, len(self.x), self.length, 2))
-        return list(found.to(dtype).permute(0, 3, 1, 2).contiguous())
+        found = found.permute(0, 3, 1, 2)[:, :, None] * self.of_x.mT[:, None]  # (moment, wave number, point, node, x)
+        return list(found.to(dtype).flatten(2, 3).contiguous())
 
     @untraced()
     def weights(self, rows: slice, dtype: torch.dtype, height_m: Tensor | None = None) -> Weights:
@@ -209,8 +230,8 @@ class Part:
         tile = tile.movedim(-1, 0).contiguous()
         # the remainders are polynomials of the wave number and of x
         waves = torch.arange(self.length, dtype=torch.float64, device=self.centre.device) - self.length // 2
-        q, to_waves = _interpolation(waves * (_TURN * step), _WAVE_DEGREE)
-        x, to_pixels = _interpolation(self.x, _PIXEL_DEGREE)
+        q, to_waves = interpolation(waves * (_TURN * step), _WAVE_DEGREE + 1)
+        x, to_pixels = interpolation(self.x, _PIXEL_DEGREE + 1)
         order, raised = self.choice.order, height_m is not None
         some = of.remainders(q[:, None, None], x, order, heights=raised)
         few = torch.stack([w.expand(-1, len(tile[0]), -1) for row in some for w in row])
@@ -267,18 +288,20 @@ class Part:
         position = (s - self.low) / self.node_step
         below = torch.ceil(position.detach() - taps / 2)
         away = (below - position)[..., None] + torch.arange(taps, device=device)
-        weights = spread_kernel(away.to(real), taps)
-        shares = None if self.shares is None else self.shares(self.centre[rows])
-        if shares is not None:
-            weights = weights * shares[:, None, self.pulses, None].to(real)
-        return Tables(first, before, after, *_spreading(below.long(), weights, self.nodes))
+        spread, node = _spreading(below.long(), spread_kernel(away.to(real), taps), self.nodes)
+        shares = None
+        if self.shares is not None:
+            points = self.offset_m[:, :, None] + self.centre[rows]
+            shares = self.shares(points)[..., self.pulses].to(real)
+            shares = pad(shares, (0, spread.shape[2] * spread.shape[4] - self.count)).unflatten(-1, spread.shape[2::2])
+        return Tables(first, before, after, spread, node, shares)
 
     def add_nodes(self, nodes: Tensor, profiles: Tensor, tables: Tables) -> None:
         """Add the windows of the pulses to the nodes of some tiles.
 
         Args:
-            nodes: Sums at the nodes, real (tile * path * node, trial * wave number * 2); changed in
-                place.
+            nodes: Sums at the nodes, real (point along y, tile * path * point along x * node,
+                trial * wave number * 2); changed in place.
             profiles: Range profiles, extended circularly, complex (path, pulse, trial, sample).
             tables: Tables of the tiles.
         """
@@ -300,16 +323,21 @@ class Part:
         if chunks * height != pulses:
             y = pad(y, (0, 0, 0, chunks * height - pulses))
         width = y.shape[-1]
-        z = torch.bmm(tables.spread.reshape(-1, joined, height), y.view(tiles * paths * chunks, height, width))
-        block = torch.arange(tiles * paths, device=y.device) * self.nodes
-        target = tables.node.reshape(tiles * paths, -1) + block[:, None]
-        nodes.index_add_(0, target.reshape(-1), z.reshape(-1, width))
+        y = y.view(tiles * paths * chunks, height, width)
+        block = torch.arange(tiles * paths, device=y.device) * self.rows
+        target = (tables.node.reshape(tiles * paths, -1) + block[:, None]).reshape(-1)
+        for j, i in itertools.product(range(len(nodes)), range(self.choice.points[0])):
+            spread = tables.spread
+            if tables.shares is not None:
+                spread = spread * tables.shares[j, i, :, None, :, None]
+            z = torch.bmm(spread.reshape(-1, joined, height), y)
+            nodes[j].index_add_(0, target + i * self.nodes, z.reshape(-1, width))
 
     def pixels_of(self, nodes: Tensor, across: Sequence[Tensor], weights: Weights) -> Tensor:
         """Form the pixels of some tiles.
 
         Args:
-            nodes: Sums at the nodes, real (tile * path * node, trial * wave number * 2).
+            nodes: Sums at the nodes for one point along y, as in `add_nodes`.
             across: Matrices of `across`.
             weights: Weights of the tiles.
 
@@ -317,8 +345,8 @@ class Part:
             Pixels, complex (tile, path * trial, x, y).
         """
         tiles, width = len(weights.pixels), len(self.x)
-        z = torch.view_as_complex(nodes.view(-1, self.nodes, nodes.shape[-1] // (2 * self.length), self.length, 2))
-        z = z.permute(3, 0, 2, 1).reshape(self.length, -1, self.nodes)
+        z = torch.view_as_complex(nodes.view(-1, self.rows, nodes.shape[-1] // (2 * self.length), self.length, 2))
+        z = z.permute(3, 0, 2, 1).reshape(self.length, -1, self.rows)
         moments = [torch.bmm(z, matrix).view(self.length, tiles, -1, width) for matrix in across]
         parts = []
         for row in weights.moments:
@@ -395,19 +423,6 @@ Weights = FlatWeights | RaisedWeights
 def _times(x: Tensor, factor: Tensor) -> Tensor:
     """Product, in the memory of x where no gradient is asked for."""
     return x * factor if x.requires_grad or factor.requires_grad else x.mul_(factor)
-
-
-def _interpolation(wanted: Tensor, degree: int) -> tuple[Tensor, Tensor]:
-    """Positions at which a polynomial is to be known, float64 (known,), and the matrix from its
-    values to those at the positions wanted, (wanted, known).
-    """
-    at = torch.arange(degree + 1, dtype=wanted.dtype, device=wanted.device)
-    at = -torch.cos((at + 0.5) * (math.pi / (degree + 1)))
-    half, middle = (wanted.max() - wanted.min()) / 2, (wanted.max() + wanted.min()) / 2
-    t = (wanted - middle) / half.clamp_min(torch.finfo(half.dtype).tiny)
-    powers = torch.arange(degree + 1, device=wanted.device)
-    matrix = linear_solve((at[:, None] ** powers).mT, (t[:, None] ** powers).mT).mT
-    return middle + half * at, matrix
 
 
 def _ramp(start: Tensor, step: Tensor, n: int, dtype: torch.dtype) -> Tensor:

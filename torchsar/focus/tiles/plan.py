@@ -3,62 +3,24 @@
 from __future__ import annotations
 
 import copy
+import functools
+import itertools
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint
 
-from torchsar.core import block_bytes_of, checked_samples, is_traced, over_blocks, untraced
+from torchsar.core import checked_samples, is_traced, untraced
 from torchsar.focus.backprojection import direct_sum, expanded_history
 from torchsar.focus.image_grid import ImageGrid
-from torchsar.focus.tiles.choice import choose, error_db
+from torchsar.focus.tiles.choice import Choice
 from torchsar.focus.tiles.expansion import slopes
-from torchsar.focus.tiles.part import Band, Part, Tables
-from torchsar.focus.tiles.scene import Lit, Scene, Weight, part_bounds, tile_centres, tile_heights
+from torchsar.focus.tiles.scene import Lit, Weight, pulse_weights
+from torchsar.focus.tiles.sector import Sector
 from torchsar.radar.antenna_path import AntennaPath, refuse_unusable
 from torchsar.radar.spotlight import frequency_step_hz
-from torchsar.radar.stripmap import LIGHT_M_S
-
-# tables of the pulses, and weights of the tiles, up to this size each (384 MB) are kept for the
-# next image, by choice: what a small machine spares
-_KEPT_BYTES = 3 << 27
-# tiles and trials whose pixels are formed at once, by choice: enough for the products, and few
-# enough that what is kept for gradients and by each thread is small
-_GROUP = 16
-# bytes of profiles that are formed at once, by choice: it limits the memory of the padded spectra
-_PROFILE_BYTES = 1 << 25
-
-
-class _Kept(dict):
-    """What an image has computed and the next one of the same form needs.
-
-    Args:
-        count: Largest number of complex values that one image adds.
-    """
-
-    def __init__(self, count: int) -> None:
-        super().__init__()
-        self.count, self.form = count, None
-
-    def begin(self, dtype: torch.dtype, tiles: int) -> None:
-        """Forget what images of another precision or number of tiles at once have left."""
-        if self.form != (dtype, tiles):
-            self.clear()
-            self.form = dtype, tiles
-
-    def keep(self, key: tuple, value: Any, dtype: torch.dtype) -> None:
-        """Keep a value unless those of an image of the precision are too large together."""
-        if self.fits(dtype):
-            self[key] = value
-
-    def fits(self, dtype: torch.dtype) -> bool:
-        """True if the values of an image of the precision are kept."""
-        return self.count * dtype.itemsize <= _KEPT_BYTES
 
 
 class TilePlan:
@@ -100,12 +62,12 @@ class TilePlan:
         error_db: Largest rms error relative to the image of a history of white noise, in dB.
         lit: For a beam that lights a part of the image at a time: function of positions in metres,
             float64 (point, 3), that returns the first pulse that lights each point and the pulse
-            after the last, int64 (point, 2), alike if there are none. All pixels of a tile are
-            summed over the pulses that light its middle, or if there are none, over those of the
-            point of a lattice in it that most pulses light. None for all pulses.
-        weight: Function of positions that returns the weights of all pulses in the sum, finite,
-            float64 (point, pulse), such as those of a beam with smooth edges; those at the same
-            point are used for all pixels of a tile. None for equal ones.
+            after the last, int64 (point, 2), alike if there are none. Each pixel is the sum over
+            the pulses that light it. None for all pulses.
+        weight: Function of positions that returns the weights of all pulses in the sum of a pixel,
+            finite, float64 (point, pulse), such as those of a beam with smooth edges. Within a tile
+            they are interpolated, as exactly as wanted; the faster they change, the longer an image
+            takes, longest with the hard edges of `lit` alone. None for equal ones.
 
     Raises:
         TypeError: If frequencies or positions are not float64.
@@ -132,54 +94,39 @@ class TilePlan:
         with untraced():
             refuse_unusable(frequency_hz=frequency_hz)
             frequency_step_hz(frequency_hz)
-            self._set_path(transmitter_m, receiver_m, reference_m)
-            with torch.no_grad():
-                self._plan([place.detach() for place in self._places])
+            places, reference_m = self._set_path(transmitter_m, receiver_m, reference_m)
+            ends = [0, self.antennas.pulses]
+            if lit is None:
+                with torch.no_grad():
+                    ends = sector_bounds([place.detach().mean(0) for place in places], grid)
+            self.bounds = list(itertools.pairwise(ends))
+            self.sectors = [
+                Sector(
+                    frequency_hz,
+                    [place[:, first:last] for place in places],
+                    reference_m[:, first:last],
+                    grid,
+                    self.error_db,
+                    lit,
+                    None if weight is None else partial(_weights_between, weight, first, last),
+                    1 / len(self.bounds),
+                )
+                for first, last in self.bounds
+            ]
 
-    def _set_path(self, transmitter_m: Tensor, receiver_m: Tensor | None, reference_m: Tensor) -> None:
-        """Bring the positions to the shape (path, pulse, 3)."""
+    @property
+    def choice(self) -> Choice:
+        """Sizes of the tiles; of several sectors those with the largest predicted error."""
+        return max((sector.choice for sector in self.sectors), key=lambda choice: choice.error_db)
+
+    def _set_path(
+        self, transmitter_m: Tensor, receiver_m: Tensor | None, reference_m: Tensor
+    ) -> tuple[list[Tensor], Tensor]:
+        """Positions (path, pulse, 3) of the antennas and reference paths (path, pulse)."""
         self.antennas = antennas = AntennaPath(transmitter_m, receiver_m, reference_m)
         size = *antennas.trials, antennas.pulses
-        self._places = [place.expand(*size, 3).reshape(-1, *size[-1:], 3) for place in antennas.places]
-        self._reference_m = reference_m.expand(size).reshape(-1, *size[-1:])
-
-    def _plan(self, every: Sequence[Tensor]) -> None:
-        """Choose the sizes and compute what does not depend on the history."""
-        nominal = [place.mean(0) for place in every]
-        grid = self.grid
-        scene = Scene(self.frequency_hz, LIGHT_M_S, nominal, every, grid, self.lit, self.weight)
-        # the second axis of a tile is that of the range, as the pulses see it that light the middle
-        middle = scene.spread[1, 1][None]
-        first, last = scene.lit_pulses(middle)[0].tolist()
-        _, a, b = slopes([v[first : max(last, first + 1)] for v in nominal], middle, grid.axes)
-        self._swapped = float(a.abs().mean()) > float(b.abs().mean())
-        if self._swapped:
-            grid = grid.transposed()
-            scene = replace(scene, grid=grid)
-        self._scene = scene
-        with torch.device("cpu"):  # tables of the choice lie there whatever the default device
-            self.choice = choice = choose(scene, self.error_db)
-        self._size = size = choice.width, choice.depth
-        self._band = Band.of(self.frequency_hz, LIGHT_M_S, choice.oversampling)
-        self._tiles = tuple(-(-n // m) for n, m in zip(grid.counts, size, strict=True))
-        self._numbers: list[Tensor] = []
-        self._zones: list[list[Part]] = []
-        self._height_m, relief = scene.relief(*size)
-        for block, pulses in scene.zones(*size):
-            i, j = (torch.arange(s.start, s.stop, device=grid.origin_m.device) for s in block)
-            self._numbers.append((i[:, None] * self._tiles[1] + j).reshape(-1))
-            centre = tile_centres(grid, *size, i, j, self._height_m)
-            if self.lit is not None:
-                _, ends = scene.seen_from(centre, *size)
-                ends = ends[ends[:, 1] > ends[:, 0]]
-                pulses = (int(ends[:, 0].min()), int(ends[:, 1].max())) if len(ends) else (0, 0)
-            bounds = part_bounds(*pulses, choice.parts)
-            given = nominal, every, centre, grid, relief, partial(scene.shares, width=size[0], depth=size[1])
-            self._zones.append([Part(self._band, choice, ends, *given) for ends in bounds])
-        parts = [part for zone in self._zones for part in zone]
-        self._table_count = sum(part.table_count for part in parts)
-        self._tables = _Kept(len(every[0]) * self._table_count)
-        self._weights = _Kept(sum(part.weight_count for part in parts))
+        places = [place.expand(*size, 3).reshape(-1, *size[-1:], 3) for place in antennas.places]
+        return places, reference_m.expand(size).reshape(-1, *size[-1:])
 
     def moved(self, transmitter_m: Tensor, receiver_m: Tensor | None, reference_m: Tensor) -> TilePlan:
         """Return the plan of a path that differs little, such as by a change of its motion errors.
@@ -203,26 +150,15 @@ class TilePlan:
         _refuse_traced(transmitter_m, receiver_m, reference_m)
         plan = copy.copy(self)
         with untraced():
-            plan._set_path(transmitter_m, receiver_m, reference_m)
-            places = [place.detach() for place in plan._places]
-            plan._tables = _Kept(len(places[0]) * plan._table_count)
-            with torch.no_grad():
-                predicted = self._error_db(places)
-                # predictions of changed paths are within 1 dB, and 3 dB in all are promised
-                if predicted <= self.error_db + 2:
-                    plan.choice = replace(self.choice, error_db=predicted)
-                else:
-                    plan._plan(places)
+            places, reference_m = plan._set_path(transmitter_m, receiver_m, reference_m)
+            if plan.antennas.pulses != self.antennas.pulses or len(places) != len(self.antennas.places):
+                given = transmitter_m, receiver_m, plan.antennas.reference_m
+                return TilePlan(self.frequency_hz, *given, self.grid, self.error_db, self.lit, self.weight)
+            plan.sectors = [
+                sector.moved([place[:, first:last] for place in places], reference_m[:, first:last])
+                for sector, (first, last) in zip(self.sectors, self.bounds, strict=True)
+            ]
         return plan
-
-    def _error_db(self, places: Sequence[Tensor]) -> float:
-        """Predicted error for other positions, each float64 (path, pulse, 3), that share what is
-        computed; infinite where they cannot.
-        """
-        if [v.shape[1:] for v in places] != [v.shape[1:] for v in self._places]:
-            return math.inf
-        covered = all(part.covers(places) for zone in self._zones for part in zone)
-        return error_db(self._scene.judging(places), self.choice) if covered else math.inf
 
     def image(self, history: Tensor) -> Tensor:
         """Form the images of phase histories.
@@ -245,13 +181,11 @@ class TilePlan:
         # trials with paths of their own come first, those that share a path after them
         own = (*(1,) * (len(lead) - len(self.antennas.trials)), *self.antennas.trials)
         order = sorted(range(len(lead)), key=lambda d: own[d] != lead[d])
-        paths = len(self._reference_m)
+        paths = self.antennas.trials.numel()
         data = history.permute(*order, -2, -1).reshape(paths, -1, *size)
-        tiles = self._formed(data.transpose(1, 2)).unflatten(0, self._tiles)  # (tile, tile, path * trial, x, y)
-        image = tiles.permute(2, 0, 3, 1, 4).flatten(1, 2).flatten(-2)
-        if self._swapped:
-            image = image.mT
-        image = image[:, : self.grid.counts[0], : self.grid.counts[1]]
+        pairs = zip(self.sectors, self.bounds, strict=True)
+        parts = (sector.image(data[..., first:last, :]) for sector, (first, last) in pairs)
+        image = functools.reduce(torch.add, parts)
         image = image.reshape(*(lead[d] for d in order), *self.grid.counts)
         return image.permute(*(order.index(d) for d in range(len(lead))), -2, -1)
 
@@ -272,125 +206,52 @@ class TilePlan:
         """
         history = checked_samples(history, "TilePlan.exact", "pulse, frequency", finite=False)
         history = expanded_history(history, self.antennas, self.frequency_hz, "TilePlan.exact")
-        grid = self.grid.transposed() if self._swapped else self.grid
+        grid = self.grid
         refuse_unusable(pixels_m=pixels_m)
         if pixels_m.ndim != 2 or pixels_m.shape[-1] != 3 or not len(pixels_m):
             raise ValueError(f"pixels_m must be positions of pixels (pixel, 3), got the shape {tuple(pixels_m.shape)}")
         at = ((pixels_m - grid.origin_m) @ grid.axes.mT / grid.step_m).round().long()
         if bool(((at < 0) | (at >= at.new_tensor(grid.counts))).any()):
             raise ValueError("pixels_m must be positions of pixels of the grid of the plan, got some outside of it")
-        i, j = (torch.arange(n, device=at.device) for n in self._tiles)
-        centres = tile_centres(grid, *self._size, i, j, self._height_m)
-        tiles, of = torch.unique(at[:, 0] // self._size[0] * len(j) + at[:, 1] // self._size[1], return_inverse=True)
-        shares = self._scene.shares(centres[tiles], *self._size)
+        weights = None
+        if self.lit is not None or self.weight is not None:
+            weights = pulse_weights(pixels_m, self.antennas.pulses, self.lit, self.weight).mT
 
         def path(pulses: slice, some: slice) -> tuple[Tensor, Tensor | None]:
-            weight = None if shares is None else shares[of[some], pulses].mT
+            weight = None if weights is None else weights[pulses, some]
             return self.antennas.path_m(pixels_m[some], pulses), weight
 
         return direct_sum(history, self.frequency_hz, path, len(pixels_m), eps=eps)
 
-    def _formed(self, data: Tensor) -> Tensor:
-        """All tiles, (tile, path * trial, x, y), of data (path, pulse, trial, frequency)."""
-        profiles = self._profiles(data)
-        paths, _, trials, _ = data.shape
-        step = max(1, _GROUP // (paths * trials))
-        for kept in (self._tables, self._weights):
-            kept.begin(data.dtype, step)
-        with untraced():
-            heights = tile_heights(self.grid.transposed() if self._swapped else self.grid, *self._size)
-            if heights is not None:
-                assert self._height_m is not None
-                heights = (heights - self._height_m[..., None, None]).flatten(0, 1)
-        found: list[Tensor] = []
-        given = [data, *self._places, self._reference_m, *([] if heights is None else [heights])]
-        grad = torch.is_grad_enabled() and any(v.requires_grad for v in given)
-        # linear in the history alone, the graph holds what is kept anyway and the places of windows
-        linear = trials <= _GROUP and not any(v.requires_grad for v in given[1:])
-        linear = linear and self._tables.fits(data.dtype) and self._weights.fits(data.dtype)
-        pixels = self._pixels if linear else partial(checkpoint, self._pixels, use_reentrant=False)
-        count = 0 if grad else math.prod(self._tiles)
-        tiles = data.new_empty(count, paths * trials, *self._size)
-        for zone, numbers in zip(self._zones, self._numbers, strict=True):
-            across = [self._weights_of((part,), data.dtype, part.across, data.dtype) for part in zone]
-            with untraced():
-                above = None if heights is None else heights[numbers]
-            rows = [slice(i, min(i + step, len(numbers))) for i in range(0, len(numbers), step)]
-            if grad:
-                fixed = across, profiles, above
-                found += [pixels(zone, some, *fixed) for some in rows]
-                continue
 
-            def work(some: slice) -> None:
-                tiles[numbers[some]] = self._pixels(zone, some, across, profiles, above)  # noqa: B023
+def sector_bounds(places: Sequence[Tensor], grid: ImageGrid, most_rad: float = math.radians(45)) -> list[int]:
+    """Divide a path into sectors, whose pulses see each point of the image within an angle.
 
-            over_blocks(work, rows, data)
-        return torch.cat(found)[torch.argsort(torch.cat(self._numbers))] if grad else tiles
+    Args:
+        places: Positions of one or two antennas, each float64 (pulse, 3).
+        grid: Pixels.
+        most_rad: Largest change of the direction in which the path to a point grows, in rad.
 
-    def _profiles(self, data: Tensor) -> Tensor:
-        """Range profiles of data (path, pulse, trial, frequency), their first samples repeated."""
-        longest = max((part.samples for zone in self._zones for part in zone), default=0)
-        length = self._band.length
-        whole = data.new_empty(*data.shape[:-1], length + longest)
-        step = max(1, _PROFILE_BYTES // (whole[:, :1].numel() * whole.element_size()))
-        for i in range(0, data.shape[1], step):
-            whole[:, i : i + step, :, :length] = self._band.profiles(data[:, i : i + step])
-        whole[..., length:] = whole[..., torch.arange(longest, device=data.device) % length]
-        return whole
+    Returns:
+        First pulse of each sector, and the number of pulses.
+    """
+    rows, columns = (torch.linspace(0, n - 1, 3, dtype=torch.float64) * grid.step_m for n in grid.counts)
+    points = torch.cartesian_prod(rows, columns).to(grid.origin_m) @ grid.axes + grid.origin_m
+    _, a, b = slopes(places, points, grid.axes)
+    turned = torch.remainder(torch.atan2(b, a).diff(dim=-1) + math.pi, 2 * math.pi) - math.pi
+    angle, bounds = torch.nn.functional.pad(turned.cumsum(-1), (1, 0)), [0]
+    extent = float((angle.amax(-1) - angle.amin(-1)).max())
+    most = extent / max(1, math.ceil(extent / most_rad)) * (1 + 1e-9)  # sectors of about equal angles
+    while bounds[-1] < angle.shape[-1]:
+        ahead = angle[:, bounds[-1] :]
+        wide = ((ahead - ahead[:, :1]).abs() > most).any(0)
+        bounds.append(bounds[-1] + int(wide.to(torch.int8).argmax()) if bool(wide.any()) else angle.shape[-1])
+    return bounds
 
-    def _pixels(
-        self,
-        zone: Sequence[Part],
-        rows: slice,
-        across: Sequence[list[Tensor]],
-        profiles: Tensor,
-        height_m: Tensor | None,
-    ) -> Tensor:
-        """Pixels of some tiles, summed over the sub-apertures, (tile, path * trial, x, y)."""
-        paths, _, trials, _ = profiles.shape
-        dtype = profiles.dtype
-        with untraced():
-            height_m = None if height_m is None else height_m[rows]
-        total = profiles.new_zeros(rows.stop - rows.start, paths * trials, *self._size) if not zone else None
-        for part, matrices in zip(zone, across, strict=True):
-            x = profiles[:, part.pulses]
-            step = max(1, block_bytes_of(x.device) // (part.samples * x[..., 0].numel() * x.element_size()))
-            height = paths * part.nodes
-            nodes = x.real.new_zeros((rows.stop - rows.start) * height, trials * part.length * 2)
-            for i in range(rows.start, rows.stop, step):
-                some = slice(i, min(i + step, rows.stop))
-                where = slice((some.start - rows.start) * height, (some.stop - rows.start) * height)
-                part.add_nodes(nodes[where], x, self._tables_of(part, some, dtype))
-            if height_m is not None and height_m.requires_grad:
-                weights = part.weights(rows, dtype, height_m)
-            else:
-                weights = self._weights_of((part, rows.start, rows.stop), dtype, part.weights, rows, dtype, height_m)
-            image = part.pixels_of(nodes, matrices, weights)
-            total = image if total is None else total + image
-        assert total is not None
-        return total
 
-    def _weights_of(self, key: tuple, dtype: torch.dtype, make: Callable, *given: Any) -> Any:
-        """What depends on the plan and the precision alone, from the last image if it is kept."""
-        key = *key, dtype
-        if key in self._weights:
-            return self._weights[key]
-        with torch.no_grad():
-            found = make(*given)
-        self._weights.keep(key, found, dtype)
-        return found
-
-    def _tables_of(self, part: Part, rows: slice, dtype: torch.dtype) -> Tables:
-        """Tables of some tiles, from the last image if they are kept."""
-        key = part, rows.start, rows.stop, dtype
-        places = *self._places, self._reference_m
-        fixed = not (torch.is_grad_enabled() and any(v.requires_grad for v in places))
-        if fixed and key in self._tables:
-            return self._tables[key]
-        tables = part.tables(rows, self._places, self._reference_m, dtype)
-        if fixed:
-            self._tables.keep(key, tables, dtype)
-        return tables
+def _weights_between(weight: Weight, first: int, last: int, points: Tensor) -> Tensor:
+    """Weights of the pulses of a sector."""
+    return weight(points)[..., first:last]
 
 
 def _refuse_traced(*known: Tensor | None) -> None:

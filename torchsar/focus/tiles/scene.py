@@ -23,7 +23,7 @@ from torchsar.core import host_value
 from torchsar.core.fft import smooth_length
 from torchsar.focus.image_grid import ImageGrid
 from torchsar.focus.tiles.expansion import Expansion, curvatures, slopes
-from torchsar.focus.tiles.kernels import CROSS_OVERSAMPLING
+from torchsar.focus.tiles.kernels import CROSS_OVERSAMPLING, interpolation
 
 # functions of positions (point, 3): first pulse that lights each, pulse after the last, (point, 2);
 # and weight of each pulse, (point, pulse)
@@ -105,6 +105,52 @@ def tile_centres(
     if height_m is not None:
         centre = centre + height_m[rows][:, columns, None] * grid.normal
     return centre.reshape(-1, 3)
+
+
+def lit_pulses(points: Tensor, pulses: int, lit: Lit | None) -> Tensor:
+    """Find the pulses that light points.
+
+    Args:
+        points: Positions in metres, float64 (..., 3).
+        pulses: Number of pulses.
+        lit: Function of positions, see `Scene`; None for all pulses.
+
+    Returns:
+        First pulse that lights each point and the pulse after the last, int64 (..., 2).
+    """
+    if lit is None:
+        return torch.tensor([0, pulses]).expand(*points.shape[:-1], 2)
+    flat = points.reshape(-1, 3)
+    found = lit(flat)
+    _refuse_other("lit", found, torch.int64, (len(flat), 2))
+    return found.cpu().clamp(0, pulses).view(*points.shape[:-1], 2)
+
+
+def pulse_weights(points: Tensor, pulses: int, lit: Lit | None, weight: Weight | None) -> Tensor:
+    """Compute the weights of pulses in the sums at points.
+
+    Args:
+        points: Positions in metres, float64 (..., 3).
+        pulses: Number of pulses.
+        lit: Function of positions, see `Scene`; None for all pulses.
+        weight: Function of positions, see `Scene`; None for equal weights.
+
+    Returns:
+        Weights, zero where a pulse does not light a point, float64 (..., pulse).
+
+    Raises:
+        ValueError: If a function returns another shape or type, or a weight is not finite.
+    """
+    flat, number = points.reshape(-1, 3), torch.arange(pulses, device=points.device)
+    first, last = lit_pulses(flat, pulses, lit).to(points.device)[..., None].unbind(-2)
+    found = ((first <= number) & (number < last)).to(torch.float64)
+    if weight is not None:
+        own = weight(flat)
+        _refuse_other("weight", own, torch.float64, (len(flat), pulses))
+        if not host_value(torch.isfinite(own).all(), True):
+            raise ValueError("weight must return finite weights of pulses, got NaN or Inf; give 0 where none counts")
+        found = found * own
+    return found.view(*points.shape[:-1], -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,54 +259,92 @@ class Scene:
     def _points(self, rows: Tensor, columns: Tensor) -> Tensor:
         """Points at rows (..., i) and columns (..., j) of pixels, float64 (..., i, j, 3)."""
         axes, (i, j) = self.grid.axes * self.grid.step_m, (v.to(self.grid.origin_m) for v in (rows, columns))
-        return self.grid.origin_m + i[..., :, None, None] * axes[0] + j[..., None, :, None] * axes[1]
+        points = self.grid.origin_m + i[..., :, None, None] * axes[0] + j[..., None, :, None] * axes[1]
+        if self.grid.height_m is None:
+            return points
+        i, j = (v.round().long().clamp(0, n - 1) for v, n in zip((i, j), self.grid.counts, strict=True))
+        return points + self.grid.height_m[i[..., :, None], j[..., None, :]][..., None] * self.grid.normal
 
     def lit_pulses(self, points: Tensor) -> Tensor:
         """First pulse that lights each point (..., 3), and the pulse after the last, (..., 2)."""
-        pulses = len(self.places[0])
+        return lit_pulses(points, len(self.places[0]), self.lit)
+
+    @property
+    def weighted(self) -> bool:
+        """Whether the sums of pixels have weights."""
+        return self.lit is not None or self.weight is not None
+
+    def weights(self, points: Tensor) -> Tensor:
+        """Weights of all pulses in the sums at points, see `pulse_weights`."""
+        return pulse_weights(points, len(self.places[0]), self.lit, self.weight)
+
+    def _some_tiles(self, *sizes: int) -> Tensor:
+        """Middles of some tiles of a size that contain lit pixels, float64 (tile, 3)."""
         if self.lit is None:
-            return torch.tensor([0, pulses]).expand(*points.shape[:-1], 2)
-        flat = points.reshape(-1, 3)
-        found = self.lit(flat)
-        _refuse_other("lit", found, torch.int64, (len(flat), 2))
-        return found.cpu().clamp(0, pulses).view(*points.shape[:-1], 2)
+            at = torch.cartesian_prod(*(torch.linspace(0, n - 1, 3, dtype=torch.float64) for n in self.grid.counts))
+        else:
+            rows, columns, lit = self.probed
+            some = (lit[..., 1] > lit[..., 0]).nonzero()
+            some = some[_between(0, len(some), 8)]
+            at = torch.stack([rows[some[:, 0]], columns[some[:, 1]]], -1).to(torch.float64)
+        # the pixels lie at different places of the tiles, which end in the image
+        place = torch.remainder(torch.arange(1, len(at) + 1)[:, None] * torch.tensor([0.7548776662, 0.5698402910]), 1)
+        half = (torch.tensor(sizes, dtype=torch.float64) - 1) / 2
+        most = torch.maximum(half, torch.tensor(self.grid.counts) - 1 - half)
+        at = torch.minimum((at + (2 * place - 1) * half).maximum(half), most)
+        return self._points(*(v[:, None] for v in at.to(self.grid.origin_m.device).unbind(-1)))[:, 0, 0]
 
-    def seen_from(self, centres: Tensor, width: int, depth: int) -> tuple[Tensor, Tensor]:
-        """Points that decide on the pulses of tiles of some centres (tile, 3), float64 (tile, 3):
-        the middle of their part of the image, or, if no pulse lights it, the point of a lattice
-        that most pulses light. And the pulses that light them, int64 (tile, 2).
-        """
-        grid, half = self.grid, (centres.new_tensor([width, depth]) - 1) / 2
-        at = ((centres - grid.origin_m) @ grid.axes.mT) / grid.step_m
-        low, high = at - half, torch.minimum(at + half, at.new_tensor(grid.counts) - 1)
-        # the middle comes first, then the lattice
-        place = torch.linspace(0, 1, 5, dtype=torch.float64, device=at.device)
-        place = torch.cat([place.new_full((1, 2), 0.5), torch.cartesian_prod(place, place)])
-        offset = low[:, None] + place * (high - low)[:, None] - at[:, None]
-        points = centres[:, None] + offset * grid.step_m @ grid.axes
-        ends = self.lit_pulses(points).to(at.device)
-        count = (ends[..., 1] - ends[..., 0]).clamp_min(0)
-        best = torch.where(count[:, 0] > 0, 0, count.argmax(-1))
-        each = torch.arange(len(at), device=at.device)
-        return points[each, best], ends[each, best]
+    @functools.cached_property
+    def _known(self) -> dict[tuple[int, int, float], tuple[int, float]]:
+        """What `points` has found."""
+        return {}
 
-    def shares(self, centres: Tensor, width: int, depth: int) -> Tensor | None:
-        """Weights with which pulses are summed in tiles of some centres (tile, 3), float64 (tile,
-        pulse), zero where a pulse does not light a tile, see `seen_from`. None if all are one.
+    def points(self, axis: int, size: int, error: float) -> tuple[int, float]:
+        """Find the number of points of a tile between which weights are interpolated.
+
+        Args:
+            axis: Axis of the tile along which the points lie.
+            size: Pixels of the tile along this axis.
+            error: Largest rms error relative to the rms of the weights.
+
+        Returns:
+            Number of points, and the error that they have, from a sample of tiles.
         """
-        if self.lit is None and self.weight is None:
-            return None
-        points, ends = self.seen_from(centres, width, depth)
-        first, last = ends[..., None].unbind(-2)
-        number = torch.arange(len(self.places[0]), device=centres.device)
-        lit = ((first <= number) & (number < last)).to(torch.float64)
-        if self.weight is None:
-            return lit
-        weight = self.weight(points)
-        _refuse_other("weight", weight, torch.float64, (len(points), len(number)))
-        if not host_value(torch.isfinite(weight).all(), True):
-            raise ValueError("weight must return finite weights of pulses, got NaN or Inf; give 0 where none counts")
-        return lit * weight
+        if not self.weighted:
+            return 1, 0.0
+        if (axis, size, error) not in self._known:
+            self._known[axis, size, error] = self._points_found(axis, size, error)
+        return self._known[axis, size, error]
+
+    def _points_found(self, axis: int, size: int, error: float) -> tuple[int, float]:
+        """Find what `points` returns."""
+        device, step = self.grid.origin_m.device, self.grid.step_m
+        centre = self._some_tiles(*((size, 1) if axis == 0 else (1, size)))
+        at = (torch.arange(size, dtype=torch.float64, device=device) - (size - 1) / 2) * step
+        true = self.weights(centre[:, None] + at[:, None] * self.grid.axes[axis])
+        power = true.square().sum().clamp_min(torch.finfo(true.dtype).tiny)
+        for known in (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 24):
+            if known >= size:
+                break
+            known_at, matrix = interpolation(at, known)
+            left = true - matrix @ self.weights(centre[:, None] + known_at[:, None] * self.grid.axes[axis])
+            found = math.sqrt(float(left.square().sum() / power))
+            if found <= error:
+                return known, found
+        return size, 0.0
+
+    def raised_error(self, width: int, depth: int) -> float:
+        """Rms error of weights, relative to their rms, due to heights of pixels above the middle
+        of their tile.
+        """
+        relief = self.relief(width, depth)[1]
+        if not (relief and self.weighted):
+            return 0.0
+        centre = self._some_tiles(width, depth)
+        level = self.weights(centre)
+        raised = self.weights(centre + (relief * _GAUSS.to(centre))[:, None, None] * self.grid.normal)
+        squares = (raised - level).square().flatten(1).sum(-1) @ _GAUSS_WEIGHT.to(centre)
+        return math.sqrt(float(squares / level.square().sum().clamp_min(torch.finfo(level.dtype).tiny)))
 
     @functools.cached_property
     def most(self) -> tuple[float, float]:
@@ -313,7 +397,7 @@ class Scene:
         ]
         if self.lit is None:
             return [(zone, (0, len(self.places[0]))) for zone in found]
-        # nine points of each zone, and those of the lattice that it contains
+        # nine points of each zone, and those of the lattice that it contains and next to them
         ends = [
             torch.tensor([(zone[axis].start * size, min(zone[axis].stop * size, n) - 1) for zone in found])
             for axis, (size, n) in enumerate(zip((width, depth), self.grid.counts, strict=True))
@@ -327,7 +411,8 @@ class Scene:
         )
         pulses = []
         for (top, bottom), (left, right), nine in zip(*inner, own, strict=True):
-            every = torch.cat([nine, probed[top:bottom, left:right].reshape(-1, 2)])
+            near = probed[max(0, top - 1) : bottom + 1, max(0, left - 1) : right + 1]
+            every = torch.cat([nine, near.reshape(-1, 2)])
             every = every[every[:, 1] > every[:, 0]]
             pulses.append((int(every[:, 0].min()), int(every[:, 1].max())) if len(every) else (0, 0))
         return list(zip(found, pulses, strict=True))

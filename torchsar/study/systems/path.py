@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Annotated, Any
@@ -17,7 +18,7 @@ from torchsar.compensate.pulse_phase.data import without_line
 from torchsar.core import Chain, Draws, Recording, Signal, Trace, per_trial
 from torchsar.echo import Impairment, simulate_path
 from torchsar.echo.path import flown_paths, nominal_geometry
-from torchsar.focus import MotionCompensation, OmegaKImage, PathImage, TilePlan, backproject
+from torchsar.focus import MotionCompensation, OmegaKImage, PathImage, ProcessedBeam, TilePlan, backproject
 from torchsar.focus.path_image import last_image, possible_plans, seen_in
 from torchsar.focus.requirements import Limit, Requirement
 from torchsar.io import read_history
@@ -273,6 +274,31 @@ def _paths(result: Result) -> Drawn:
     yield "paths", "Paths", caption, plot.panels(parts)
 
 
+def _geometry(result: Result) -> Drawn:
+    """Draw the paths of the antennas and the imaged area from above, with the line of sight."""
+    stage = last_image(result.bench.chains["recommended"].stages.values())
+    aux = result.first.trials.recording.aux
+    if stage is None or "transmitter_m" not in aux:
+        return
+    antennas = AntennaPath.recorded(aux)
+    antennas = antennas.of_trial((0,) * len(antennas.trials))
+    names = (
+        ("path of the transmitter", "path of the receiver") if len(antennas.places) > 1 else ("path of the antenna",)
+    )
+    ends = (slice(None, None, max(1, n - 1)) for n in stage.grid.counts)
+    corners = plot.array(stage.grid.pixels_m(*ends)[..., :2].reshape(-1, 2))
+    ring = corners[[0, 1, 3, 2, 0]] if len(corners) == 4 else corners
+    flown = {name: plot.array(place[:, :2]) for name, place in zip(names, antennas.places, strict=True)}
+    sight = np.stack([flown[names[0]].mean(0), corners.mean(0)])
+    lines = {**flown, "imaged area": ring, "line of sight": sight}
+    series = {name: (line[:, 0], line[:, 1]) for name, line in lines.items()}
+    caption = (
+        "The first trial from above: paths, the imaged area of the recommended method, and the mean line of sight."
+    )
+    part = {"series": series, "xlabel": "x (m)", "ylabel": "y (m)", "title": "geometry from above"}
+    yield "geometry", "Geometry from above", caption, plot.panels([part])
+
+
 class AnyPath(System):
     """Antennas on any path."""
 
@@ -321,7 +347,7 @@ class AnyPath(System):
         "pslr_range_db": Column("PSLR in range", "dB"),
     }
 
-    draw_case = (_images, _paths)
+    draw_case = (_images, _geometry, _paths)
     read = staticmethod(read_history)  # pyright: ignore[reportAssignmentType]
 
     def context(self, recording: Recording) -> dict[str, Any]:
@@ -375,16 +401,25 @@ class AnyPath(System):
         return {"path_residual_rms_m": {"Cramer-Rao": bound.expand(count)}}
 
     def limits(self, bench: Bench) -> Mapping[Limit, Sequence[str]]:
-        """Return the limits of the sample spacing of the images, by the nominal path."""
+        """Return the limits of sample spacing and pulses of the images, by the nominal path."""
         geometry = (
             nominal_geometry(bench.radar, (world := bench.world()).of(), world.pulses, world.samples)
             if bench.recording is None
             else (AntennaPath.recorded(bench.recording.aux), bench.recording.aux["frequency_hz"])
         )
         images = {name: last_image(chain.stages.values()) for name, chain in bench.chains.items()}
-        found = by_limit((at, name) for name, one in images.items() if one for at in one.sampling_limits(*geometry))
-        beam = None if bench.recording is not None else bench.world().beam
-        return found if beam is None else {**found, _band_limit(bench.radar, geometry[0], beam): list(images)}
+        lit = None if bench.recording is not None else bench.world().beam
+        antenna = (None, None)
+        if lit is not None:
+            numbers = (float(torch.as_tensor(v).mean()) for v in (lit.width_deg, lit.squint_deg))
+            with suppress(ValueError):  # a beam that reaches the track has no band
+                antenna = lit.mean_power, ProcessedBeam(*numbers)
+        return by_limit(
+            (at, name)
+            for name, one in images.items()
+            if one
+            for at in (*one.pulse_limits(*geometry, *antenna), *one.sampling_limits(*geometry))
+        )
 
     def requirements(self, bench: Bench) -> Sequence[Requirement]:
         """Return what the flight of the first trial requires, see `flight_requirements`."""
@@ -499,23 +534,6 @@ def flight_requirements(
     ]
     neglects = f"an error of {off:.3g} m/s; {tolerated:.3g} m/s leave a phase of pi / 4 at the ends of {dwell_s:.3g} s"
     return [*found, Requirement("the recorded speed", neglects, quarter * off / tolerated, math.nan, quarter, remedy)]
-
-
-def _band_limit(radar: InverseRadar, antennas: AntennaPath, beam: SideBeam) -> Limit:
-    """The limit of the pulse rate, below which the Doppler band of the beam folds."""
-    place = antennas.places[-1].detach().reshape(-1, antennas.pulses, 3).mean(0)
-    speed = float(torch.linalg.vector_norm(place.diff(dim=0), dim=-1).mean()) * radar.prf_hz
-    width = math.radians(float(torch.as_tensor(beam.width_deg).max()))
-    return Limit(
-        "the pulse rate, against the half-power Doppler band of the beam",
-        radar.prf_hz,
-        4 * speed / radar.wavelength_m * math.sin(width / 2),
-        "Hz",
-        "warn",
-        "the band folds, so that ghosts appear in azimuth",
-        "raise radar.prf_hz, fly slower, or narrow the beam",
-        at_least=True,
-    )
 
 
 def _measured(
