@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import pytest
 import torch
+from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchsar.core import Axis, Draws, Signal
-from torchsar.metrics import contrast, correlation, entropy, error_db, impulse, impulse_response
+from torchsar.metrics import contrast, correlation, entropy, error_after_gain_db, error_db, impulse, impulse_response
 
 
 def test_entropy_known_answers():
@@ -291,3 +293,14 @@ def test_a_part_of_an_interpolated_cut_equals_that_part_of_the_whole(n):
     part, whole = impulse._about_zero(spectrum, 32), impulse._about_zero(spectrum, n)
     middle = whole.shape[-1] // 2
     torch.testing.assert_close(part, whole[..., middle - 511 : middle + 512], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("measure", [correlation, error_db, error_after_gain_db])
+@pytest.mark.parametrize("scale", [0.0, 1.0])
+def test_gradients_at_no_error_and_at_zeros_are_finite(measure: Callable[..., Tensor], scale: float) -> None:
+    reference = torch.randn(2, 6, 5, dtype=torch.complex128, generator=torch.Generator().manual_seed(1))
+    image = (scale * reference).requires_grad_()
+    measure(image, reference).sum().backward()
+    assert image.grad is not None and bool(torch.isfinite(torch.view_as_real(image.grad)).all())
+    if scale or measure is correlation:
+        assert float(image.grad.abs().max()) < 1e-9

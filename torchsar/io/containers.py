@@ -84,24 +84,12 @@ class Container:
     find: Callable[[str], tuple[Any, Callable[[Slices], np.ndarray]]]
     names: Callable[[], Iterable[str]]
 
-    def only(self) -> str:
-        """Return the name of the only array.
-
-        Raises:
-            ValueError: If there are several.
-        """
-        with reading(self.path, self.kind):
-            names = list(self.names())
-        if len(names) != 1:
-            raise ValueError(f"{self.path} ({self.kind}) holds the arrays {', '.join(names)}; give name, one of them")
-        return names[0]
-
-    def array(self, name: str) -> BlockArray:
+    def array(self, name: str | None) -> BlockArray:
         """Return an array by its name.
 
         Args:
             name: Its name, with '/' between the names of groups or structures and that of the
-                array. In HDF5, `group@attribute` is an attribute.
+                array. In HDF5, `group@attribute` is an attribute. None for the only array.
 
         Returns:
             The array; nothing but its shape and type was read.
@@ -110,6 +98,12 @@ class Container:
             ValueError: If there is no such array, or it does not hold numbers.
         """
         with reading(self.path, self.kind):
+            names = list(self.names()) if name is None else [name]
+            if len(names) != 1:
+                raise ValueError(
+                    f"{self.path} ({self.kind}) holds the arrays {', '.join(names)}; give name, one of them"
+                )
+            name = names[0]
             try:
                 array, part = self.find(name.strip("/"))
             except KeyError:

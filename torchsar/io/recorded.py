@@ -99,7 +99,8 @@ def read_stripmap(path: str | Path, dtype: torch.dtype = torch.complex64, regula
     """
     recording = read_described(path, dtype, "raw stripmap data", describe_stripmap)
     level = Level()
-    level.add(recording.signal.data.numpy())
+    for block in recording.signal.data.split(1024):  # lines, so that copies are small
+        level.add(block.numpy())
     level.warn(str(path), "offset")
     if not regular:
         return recording

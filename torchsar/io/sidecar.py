@@ -203,7 +203,7 @@ def import_recording(path: str | Path, sidecar: Mapping[str, Any], out: str | Pa
         raise FileExistsError(f"{out} exists and is not replaced; move it, or choose another name")
     tree = _section(sidecar, name, _SECTIONS)
     keys = _SYSTEMS[_choice(tree.get("system"), f"{name}: system", _SYSTEMS)]
-    layout = _section(tree.get("samples"), f"{name}: samples", _SAMPLES)
+    layout = _section(tree.get("samples"), f"{name}: samples", _SAMPLES, ("dims",))
     key = _choice(layout.get("key", keys[0] if "profiles" not in keys else None), f"{name}: samples.key", keys)
     kind = _KINDS[key]
     with ExitStack() as stack:
@@ -244,7 +244,7 @@ def _samples(file: _File, tree: Mapping[str, Any], where: str, order: tuple[str,
     """The samples as one complex array (slow, fast), in the order of the file, the name of its slow
     dim, and whether the numbers in the file have no sign.
     """
-    dims, choose = [str(one) for one in _needed(tree, "dims", where, _SAMPLES)], dict(tree.get("choose", {}))
+    dims, choose = [str(one) for one in tree["dims"]], dict(tree.get("choose", {}))
     further, pair = [one for one in dims if one not in (*order, "iq")], "iq" in dims
     if not {*order} <= {*dims} or len({*dims}) < len(dims):
         raise ValueError(
@@ -289,9 +289,10 @@ def _samples(file: _File, tree: Mapping[str, Any], where: str, order: tuple[str,
     def complex_part(slices: tuple[slice, ...]) -> np.ndarray:
         index = {**{one: slice(i, i + 1) for one, i in choose.items()}, slow: slices[0]}
         held = [part.read(tuple(index.get(one, slice(None)) for one in dims)) for part in parts]
-        if table is not None:
-            with naming(f"{where}.table"):
-                held = [_looked_up(table, x) for x in held]
+        if table is not None and any(x.min() < 0 or x.max() >= len(table) for x in held):
+            ends = [(int(x.min()), int(x.max())) for x in held]
+            raise ValueError(f"{where}.table has {len(table)} entries, and samples are from and to {ends}")
+        held = held if table is None else [table[x] for x in held]
         real_imag = turn(held[0]) if pair else held
         block = joined(*real_imag) if len(real_imag) == 2 and "c" not in kinds else held[0]
         left = [one for one in dims if one != "iq"]
@@ -331,13 +332,6 @@ def _offset(tree: Mapping[str, Any], where: str) -> complex:
     return complex(*both)
 
 
-def _looked_up(table: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """Entries of a table."""
-    if index.min() < 0 or index.max() >= len(table):
-        raise ValueError(f"it has {len(table)} entries, and samples are {index.min()} to {index.max()}")
-    return table[index]
-
-
 def _array(file: _File, path: Path, tree: Mapping[str, Any], where: str) -> BlockArray:
     """The array in a file that `name` or the layout of a flat binary file describes."""
     container = file.opened(path)
@@ -346,7 +340,7 @@ def _array(file: _File, path: Path, tree: Mapping[str, Any], where: str) -> Bloc
         if flat:
             raise ValueError(f"{where}.{flat[0]}: {path} is a {container.kind} file; give name instead")
         with naming(where):
-            return container.array(tree["name"] if "name" in tree else container.only())
+            return container.array(tree.get("name"))
     if "name" in tree or not flat:
         raise ValueError(
             f"{where}: {path} is no HDF5, MATLAB, numpy or .csv file; if it is flat binary, give dtype and shape, and "
@@ -372,9 +366,11 @@ def _value(file: _File, value: Any, where: str, own: str, n: int | None) -> np.n
         match = _WITH_UNIT.fullmatch(value.strip())
         value, unit = (float(match[1]), match[2]) if match else ({"name": value}, None)
     if isinstance(value, Mapping):
-        tree = _section(value, where, _ENTRY)
-        unit = tree.get("unit")
-        array = _steps(tree, where, n) if {"first", "step"} & set(tree) else _entry(file, tree, where)
+        steps = {"first", "step"} & set(value)
+        tree = _section(value, where, _ENTRY, ("first", "step") if steps else ())
+        unit, path = tree.get("unit"), file.path.parent / tree["file"] if "file" in tree else file.path
+        array = _steps(tree, where, n) if steps else _array(file, path, tree, where).read()
+        array = array.T if tree.get("transpose", False) else array
     else:
         array = _numbers(value, where, own)
     # MATLAB has no numbers and no vectors, only matrices
@@ -388,15 +384,10 @@ def _value(file: _File, value: Any, where: str, own: str, n: int | None) -> np.n
     return array.astype(np.float64) * accepted[unit]
 
 
-def _entry(file: _File, tree: Mapping[str, Any], where: str) -> np.ndarray:
-    """The numbers of an array in a file."""
-    path = file.path.parent / tree["file"] if "file" in tree else file.path
-    array = _array(file, path, tree, where).read()
-    return array.T if tree.get("transpose", False) else array
-
-
-def _section(tree: Any, where: str, accepted: _Keys) -> dict[str, Any]:
-    """A mapping with no other keys than the accepted ones, whose values have their types."""
+def _section(tree: Any, where: str, accepted: _Keys, needed: Sequence[str] = ()) -> dict[str, Any]:
+    """A mapping with the needed keys and no others than the accepted ones, whose values have their
+    types.
+    """
     if not isinstance(tree, Mapping):
         got = "nothing" if tree is None else repr(tree)
         raise ValueError(f"{where} must be a mapping with some of the keys {', '.join(accepted)}, got {got}")
@@ -410,14 +401,10 @@ def _section(tree: Any, where: str, accepted: _Keys) -> dict[str, Any]:
             and (not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool))
         ):
             raise ValueError(f"{where}.{key} must be {words}, got {value!r}")
+    for key in needed:
+        if tree.get(key) is None:
+            raise ValueError(f"{where} lacks the key {key!r}, {accepted[key][1]}")
     return {key: value for key, value in tree.items() if value is not None}
-
-
-def _needed(tree: Mapping[str, Any], key: str, where: str, keys: _Keys) -> Any:
-    """The value of a key that must be there."""
-    if key not in tree:
-        raise ValueError(f"{where} lacks the key {key!r}, {keys[key][1]}")
-    return tree[key]
 
 
 def _numbers(value: Any, where: str, unit: str) -> np.ndarray:
@@ -440,8 +427,7 @@ def _steps(tree: Mapping[str, Any], where: str, n: int | None) -> np.ndarray:
     if n is None or other:
         what = f"{other[0]} is given too" if other else "this key has no length of its own"
         raise ValueError(f"{where}: first and step cannot be used here, since {what}; give the name of an array")
-    first, step = (_needed(tree, key, where, _ENTRY) for key in ("first", "step"))
-    return first + step * np.arange(n, dtype=np.float64)
+    return tree["first"] + tree["step"] * np.arange(n, dtype=np.float64)
 
 
 def _choice(value: Any, where: str, accepted: Sequence[str] | Mapping[str, Any]) -> str:

@@ -211,11 +211,11 @@ def _sum(x: Tensor, weight: Tensor | None = None) -> Tensor:
 
 def _norm(x: Tensor) -> Tensor:
     """Square root of the energy of each image, summed in float64; in float32 the sum of a million
-    terms would lose the fourth digit, and squares could overflow.
+    terms would lose the fourth digit, and squares could overflow. Its gradient is 0 at zeros.
     """
     level = level_of(x)
-    unit = x / level
-    return power_of(unit).sum((-2, -1), dtype=torch.float64).sqrt() * level[..., 0, 0]
+    energy = power_of(x / level).sum((-2, -1), dtype=torch.float64)
+    return torch.where(energy > 0, torch.where(energy > 0, energy, 1.0).sqrt(), 0.0) * level[..., 0, 0]
 
 
 def correlation(image: Tensor | Signal, reference: Tensor | Signal) -> Tensor:
@@ -228,7 +228,8 @@ def correlation(image: Tensor | Signal, reference: Tensor | Signal) -> Tensor:
     >>> [round(float(metrics.correlation(x, image)), 3) for x in (5j * image, other)]
     [1.0, 0.556]
 
-    Invariant to a common gain and phase. 0 where one image is all zero.
+    Invariant to a common gain and phase. 0 where one image is all zero. Differentiable, with the
+    gradient 0 there.
 
     Args:
         image: Image I, shape (..., azimuth, range), complex, or a Signal.
@@ -257,6 +258,7 @@ def error_db(image: Tensor | Signal, reference: Tensor | Signal) -> Tensor:
     -20.0
 
     A difference in gain or phase counts as error; use `correlation` where those are arbitrary.
+    Differentiable, with the gradient 0 where there is no error.
 
     Args:
         image: Image I, shape (..., azimuth, range), complex, or a Signal.
