@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Signal
-from torchsar.focus.image_grid import ImageGrid
 from torchsar.focus.path_image import TileImage, spatial_band
 from torchsar.focus.requirements import Limit
 from torchsar.radar import LIGHT_M_S, AntennaPath
@@ -260,36 +259,6 @@ class SpotlightImage(TileImage):
     def sampling_limits(self, antennas: AntennaPath, frequency_hz: Tensor) -> list[Limit]:
         """Return the limits of a given spacing, see `PathImage`; none of that of `scene_grid`."""
         return [] if self._own_step else super().sampling_limits(antennas, frequency_hz)
-
-    def form(self, history: Tensor, frequency_hz: Tensor, antennas: AntennaPath, grid: ImageGrid) -> Tensor:
-        """Form the image by tiles, of wide arcs as the sum of the images of parts.
-
-        Args:
-            history: Phase history, shape (..., pulse, frequency), complex.
-            frequency_hz: Frequencies in Hz, shape (frequency,).
-            antennas: Path of the antennas.
-            grid: Pixels.
-
-        Returns:
-            Image, shape (..., azimuth, range).
-        """
-        middle = grid.pixels_m(*(slice(n // 2, n // 2 + 1) for n in grid.counts))[0, 0]
-        place = torch.stack([x.detach().reshape(-1, antennas.pulses, 3).mean(0) for x in antennas.places]).mean(0)
-        away = (place - middle.to(place))[:, :2]
-        turn = torch.zeros(antennas.pulses, dtype=away.dtype, device=away.device)
-        turn[1:] = torch.remainder(torch.atan2(away[:, 1], away[:, 0]).diff() + math.pi, 2 * math.pi) - math.pi
-        turn = turn.cumsum(0)
-        # by choice parts of 15 degrees, which tiles image well, of arcs beyond 60 degrees
-        wide = float(turn.amax() - turn.amin()) > math.radians(60)
-        part = (turn / math.radians(15)).floor().long() if wide else torch.zeros_like(turn, dtype=torch.long)
-        image = 0
-        for one in part.unique():
-            pulses = part == one
-            receiver = None if antennas.receiver_m is None else antennas.receiver_m[..., pulses, :]
-            some = AntennaPath(antennas.transmitter_m[..., pulses, :], receiver, antennas.reference_m[..., pulses])
-            image = image + super().form(history[..., pulses, :], frequency_hz, some, grid)
-        assert isinstance(image, Tensor)
-        return image
 
     def forward(
         self,
