@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import io
+import json
 import os
 import random
 import subprocess
@@ -13,7 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from torchsar.study.output.folder import STATE, fresh_result, opened
+from torchsar.io.seal import sealed
+from torchsar.study.output.folder import STATE, _print_of, fresh_result, opened
 from torchsar.study.settings.errors import ConfigError
 
 NAMES = ("metrics.json", "figures", "report.html")
@@ -298,3 +300,35 @@ def test_any_flipped_bit_of_a_manifest_is_found(out: Path) -> None:
     path.write_bytes(data)
     with opened(out, "run", NAMES):
         pass
+
+
+@pytest.mark.parametrize(
+    "name", ["../notes.txt", "link/notes.txt", ".torchsar/lock", "/etc/hostname", "a/../../notes.txt"]
+)
+@pytest.mark.parametrize("entry", ["files", "old"])
+def test_a_manifest_that_names_files_outside_touches_nothing(name: str, entry: str, out: Path) -> None:
+    """As in a folder from somebody else: files are compared by prints that anybody can compute."""
+    outside = out.parent / "notes.txt"
+    outside.write_text("of another project")
+    (out / "link").symlink_to("..")
+    (out / STATE / "new").mkdir()
+    planted = out / STATE / "new" / "report.html"
+    planted.write_text("new")
+    prints = {name: _print_of(outside), "report.html": _print_of(planted)}
+    tree = {"kind": "run", entry: prints, **({"old": {}} if entry == "files" else {})}
+    (out / STATE / "manifest.json").write_text(json.dumps(sealed(tree)))
+    before = {path: path.read_bytes() for path in out.parent.rglob("*") if path.is_file()}
+    with pytest.raises(ConfigError, match="no file of a result in this folder"), fresh_result(out, "run", NAMES):
+        pass
+    assert before == {path: path.read_bytes() for path in out.parent.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("which", [STATE, f"{STATE}/new"])
+def test_a_state_behind_a_link_is_refused(which: str, out: Path) -> None:
+    other = out.parent / "other"
+    (out / STATE).rename(other) if which == STATE else other.mkdir()
+    (other / "mine.txt").write_text("mine")
+    (out / which).symlink_to(other)
+    with pytest.raises(ConfigError, match="is a link"), fresh_result(out, "run", NAMES):
+        pass
+    assert (other / "mine.txt").read_text() == "mine"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import signal
 import threading
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -100,18 +101,23 @@ class Distributed:
 
         self.client.register_plugin(_plugin(work, self.threads, self.own), name=_PLUGIN)
         source, waiting, done = iter(tasks), {}, as_completed()
+        asked, workers = time.monotonic(), self.workers
 
-        def submit(count: int) -> None:
-            for chunk, fits in islice(source, count):
+        def submit() -> None:
+            """Fill the queue for the workers that there are; those of a cluster come and go."""
+            nonlocal asked, workers
+            if not self.own and time.monotonic() > asked + 1:
+                asked, workers = time.monotonic(), len(self.client.nthreads())
+            for chunk, fits in islice(source, max(0, _QUEUE * max(1, workers) - len(waiting))):
                 future = self.client.submit(_compute, chunk, fits, pure=False)
                 waiting[future] = chunk
                 done.add(future)
 
         try:
-            submit(_QUEUE * max(1, self.workers))
+            submit()
             for future in done:
                 yield waiting.pop(future), future.result()
-                submit(1)
+                submit()
         except KilledWorker as error:
             raise ConfigError(
                 f"the workers of the sweep died one after the other ({one_line(error)}), most likely because memory "
@@ -166,7 +172,7 @@ def _local(distributed: Any, workers: int, threads: int) -> Iterator[Engine]:
         ),
         "distributed.scheduler.allowed-failures": _DEATHS,
     }
-    wanted = {"threads_per_worker": 1, "processes": True, "dashboard_address": ":0", "silence_logs": 50}
+    wanted = {"threads_per_worker": 1, "processes": True, "dashboard_address": None, "silence_logs": 50}
     with config.set(settings):
         try:
             cluster = distributed.LocalCluster(n_workers=workers, memory_limit=0, **wanted)
@@ -189,4 +195,4 @@ def _remote(distributed: Any, address: str, threads: int) -> Iterator[Engine]:
         ) from None
     with client:
         client.wait_for_workers(1, timeout=600)
-        yield Distributed(client, len(client.scheduler_info()["workers"]), threads)
+        yield Distributed(client, len(client.nthreads()), threads)

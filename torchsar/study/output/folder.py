@@ -114,8 +114,14 @@ class ResultFolder:
     def finish(self) -> None:
         """Complete a replacement that was interrupted, and remove files of incomplete results."""
         held, new = self._manifest(), self.path / STATE / "new"
+        if new.is_symlink() or new.parent.is_symlink():
+            raise ConfigError(f"--out {self.path}: {new} is a link, not made by torchsar; choose another folder")
         if held["old"] is not None:
             files, old = held["files"], held["old"]
+            for name in {*files, *old}:
+                above = [place / folder for place in (self.path, new) for folder in Path(name).parents]
+                if any(folder.is_symlink() for folder in above if folder != self.path):
+                    self._refuse_outside(name)
             for name in sorted(old, key=_rank, reverse=True):
                 moved = name in files and not (new / name).exists()
                 if not moved and _print_of(self.path / name) == old[name]:
@@ -146,7 +152,20 @@ class ResultFolder:
             raise ConfigError(
                 f"{path} is damaged, since it differs from its checksum; choose another folder, or remove it"
             )
+        tree = {"kind": None, "files": {}, "old": None, **tree}
+        if not isinstance(tree["files"], dict) or not isinstance(tree["old"], dict | None):
+            raise ConfigError(f"{path} lists no files; choose another folder, or remove it")
+        for name in (*tree["files"], *(tree["old"] or {})):
+            parts = Path(name).parts
+            if not parts or Path(name).is_absolute() or ".." in parts or parts[0] == STATE:
+                self._refuse_outside(name)
         return tree
+
+    def _refuse_outside(self, name: str) -> None:
+        raise ConfigError(
+            f"--out {self.path}: {STATE}/manifest.json names {name!r}, which is no file of a result in this folder; "
+            "the folder was not made by torchsar alone, choose another one"
+        )
 
     def _note(self, **changes: Any) -> None:
         """Replace entries of the manifest; the file changes as a whole."""
