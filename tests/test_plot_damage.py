@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -46,6 +47,12 @@ def test_sizes_do_not_change_the_average_of_blocks() -> None:
     expected = signal.data.abs().square().unflatten(0, (12, 2)).unflatten(2, (16, 2)).mean((1, 3)).sqrt()
     for scale in (1e30, 1.0, 1e-30):
         torch.testing.assert_close(plot.quicklook(signal_of(scale * signal.data), 16).data, scale * expected)
+
+
+@pytest.mark.parametrize("text", [r"$\SI{1}{m/s}$", r"$\frac{1}$", "5 $ and 6 $", r"$\sigma$ of $10^3$", "$"])
+def test_texts_that_are_no_formulas_are_shown_as_they_are_written(text: str) -> None:
+    series = {text: (np.arange(3.0), np.arange(3.0)), "b": (np.arange(3.0), np.ones(3))}
+    plot.save(plot.curves(series, text, text, title=text), io.BytesIO())
 
 
 def test_a_picture_that_fails_costs_no_other(tmp_path: Path) -> None:

@@ -289,6 +289,12 @@ MISTAKEN = {
 }
 
 
+@pytest.mark.parametrize("grid", [5, [1, 2], "x"])
+def test_a_grid_that_is_no_mapping_is_refused_beside_other_keys(grid: object) -> None:
+    with pytest.raises(ConfigError, match="'sweep.grid' has the value"):
+        load("stripmap_doppler", [f"sweep.grid={grid}", "sweep.world.noise.snr_db=[0, 1]"])
+
+
 @pytest.mark.parametrize("name", MISTAKEN)
 def test_numbers_of_no_use_are_refused_with_their_unit(name: str) -> None:
     for assignment, *expected in MISTAKEN[name]:

@@ -18,6 +18,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imsave
+from matplotlib.mathtext import MathTextParser
+from matplotlib.text import Text
 from torch import Tensor
 
 # palette by choice: text and frames, then colours of curves in their order
@@ -83,6 +85,9 @@ Drawn = TypeVar("Drawn", Figure, list[Figure])
 def styled(draw: Callable[..., Drawn]) -> Callable[..., Drawn]:
     """Run a drawing function in the style of this package, without a change of global settings.
 
+    Texts that are no formulas of matplotlib, such as commands of LaTeX that it lacks, are shown as
+    they are written.
+
     Args:
         draw: Function that returns a figure or a list of figures.
 
@@ -94,9 +99,21 @@ def styled(draw: Callable[..., Drawn]) -> Callable[..., Drawn]:
     def styled(*args: Any, **options: Any) -> Any:
         with rc_context(_STYLE):
             drawn = draw(*args, **options)
+        for figure in drawn if isinstance(drawn, list) else [drawn]:
+            for text in figure.findobj(Text):
+                text.set_parse_math("$" in text.get_text() and _is_formula(text.get_text()))
         return Panels(drawn) if isinstance(drawn, list) else drawn
 
     return styled
+
+
+def _is_formula(text: str) -> bool:
+    """Whether matplotlib can show a text as it shows formulas."""
+    try:
+        MathTextParser("path").parse(text)
+    except ValueError:
+        return False
+    return True
 
 
 def new_figure(width: float, height: float, to_scale: bool = False) -> tuple[Figure, Axes]:

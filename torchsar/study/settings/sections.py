@@ -143,7 +143,8 @@ class Sweep(Strict):
             return given
         loose = {key: value for key, value in given.items() if key not in cls.model_fields}
         known = {key: value for key, value in given.items() if key in cls.model_fields}
-        return {**known, "grid": {**(known.get("grid") or {}), **loose}} if loose else known
+        grid = known.get("grid") or {}
+        return {**known, "grid": {**grid, **loose}} if loose and isinstance(grid, dict) else known
 
 
 class Config(Strict):
