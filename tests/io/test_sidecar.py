@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import tracemalloc
 import warnings
 from collections.abc import Callable, Mapping
@@ -21,6 +22,7 @@ from tests.test_docs import DOCS, block_with
 from torchsar.cli import main
 from torchsar.core import Recording
 from torchsar.io import import_recording, read, read_inverse, read_path, read_stripmap, sidecar
+from torchsar.io.extras import reading
 from torchsar.study.commands import run
 from torchsar.study.settings.text import parse
 
@@ -188,6 +190,13 @@ def test_units_steps_attributes_and_further_files(tmp_path: Path) -> None:
     assert found.radar.prf_hz == 250.0
     torch.testing.assert_close(found.aux["frequency_hz"], torch.from_numpy(TURNTABLE["freq_hz"]), rtol=1e-15, atol=0)
     torch.testing.assert_close(found.aux["angle_rad"], torch.from_numpy(np.deg2rad(TURNTABLE["angle_deg"])))
+
+
+def test_own_warnings_pass_while_libraries_are_quiet(caplog: pytest.LogCaptureFixture) -> None:
+    with reading(Path("a.cphd"), "CPHD"):
+        logging.getLogger("torchsar").warning("kept")
+        logging.getLogger("jbpy.core").error("left out")
+    assert caplog.messages == ["kept"]
 
 
 def imported(path: Path, data: np.ndarray, samples: Mapping[str, Any], **more: Any) -> torch.Tensor:

@@ -43,14 +43,17 @@ def quiet() -> Iterator[None]:
     Yields:
         Nothing.
     """
-    before = logging.root.manager.disable
-    logging.disable(logging.CRITICAL)
+    loggers = [logging.getLogger(name) for name in ("jbpy", "sarkit")]
+    before = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL + 1)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)
             yield
     finally:
-        logging.disable(before)
+        for logger, level in zip(loggers, before, strict=True):
+            logger.setLevel(level)
 
 
 @contextmanager
