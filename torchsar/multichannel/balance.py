@@ -211,14 +211,18 @@ def estimate_balance(
         position = frequency / highest if delays else None
         middle = None if position is None else position.view(blocks, -1).mean(-1)
         turn = torch.zeros(*data.shape[:-3], radar.channels, dtype=torch.float64, device=data.device)
-        products = _products(lines, blocks, no_power)
         if position is not None and middle is not None:
+            products = _products(lines, blocks, no_power)
             coarse_db = 20.0  # by trial: from 20 dB on, delays hardly depend on it
             by_block = model.weights(products.movedim(-3, 0), coarse_db)[0].movedim(0, -2)
             turn = _slope(by_block, middle, reference)
             products = _products(_turned(lines, turn, position), blocks, no_power)
             turn = turn + model.fit(products, coarse_db, middle).turn
-            products = _products(_turned(lines, turn, position), blocks, no_power)
+            lines = _turned(lines, turn, position)
+        cells = torch.fft.ifft(lines, norm="ortho")
+        weight = model.homogeneous(cells, no_power)
+        lines = torch.fft.fft(cells * weight.sqrt()[..., None, None, :], norm="ortho")
+        products = _products(lines, blocks, no_power)
         mean = products.mean(-3)
         snr_db = model.snr_db(mean)
         weights = model.weights(mean, snr_db)[0]
@@ -227,8 +231,7 @@ def estimate_balance(
             model = model.adapted(mean, weights, snr_db)
             snr_db = model.snr_db(mean)
         fit = model.fit(products, snr_db, middle)
-        turn = turn + fit.turn
-        delay = turn / (2 * math.pi * highest)
+        delay = (turn + fit.turn) / (2 * math.pi * highest)
         own = fit.weights[..., reference, None]
         value = {
             "phase_rad": torch.angle(fit.weights.conj() * own),
@@ -240,10 +243,10 @@ def estimate_balance(
             return Estimate(value, info={"snr_db": snr_db}, outcome=Outcome.NOT_ASSESSED.like(snr_db))
         lines = lines * fit.weights[..., None, None]
         if position is not None:
-            lines = _turned(lines, turn, position)
+            lines = _turned(lines, fit.turn, position)
         lead = first[0].lead(mean, weights, first[1]) if 1 < bands < radar.channels else None
         (phase_std, log_std, turn_std), quality, outcome = assessed_balance(
-            lines, model, fit, snr_db, position, reference, no_power, lead
+            lines, weight, model, fit, snr_db, position, reference, no_power, lead
         )
         std = {
             "phase_rad": phase_std,

@@ -23,6 +23,7 @@ from torchsar.multichannel.clutter_fit import ClutterModel, Fit
 
 def assessed_balance(
     lines: Tensor,
+    weight: Tensor,
     model: ClutterModel,
     fit: Fit,
     snr_db: Tensor,
@@ -35,6 +36,7 @@ def assessed_balance(
 
     Args:
         lines: Balanced spectra, complex128 (..., channel, bin, range frequency).
+        weight: Weights of the range cells, of mean 1, zero where a cell is left out, (..., cell).
         model: Model of the clutter.
         fit: Fit of the weights of the channels.
         snr_db: SNR of the model, (...,).
@@ -52,7 +54,7 @@ def assessed_balance(
     inverse, channels = matrix_inverse(model.noisy(snr_db)), lines.shape[-3]
     inner = (inverse @ lines.movedim(-3, -2)).movedim(-2, -3)
     cells, within = (torch.fft.ifft(x, norm="ortho") for x in (lines, inner))
-    along, over_bins = _covariance(_score(cells, within, -2)), _covariance(_score(lines, inner, -1), 16)
+    along, over_bins = _covariance(_score(cells, within, -2, weight)), _covariance(_score(lines, inner, -1), 16)
     hessian, determined = _inverse(fit.hessian, reference, channels)
 
     def std(covariance: Tensor, rows: Tensor, unknown: float = 1e3) -> Tensor:
@@ -68,12 +70,14 @@ def assessed_balance(
         turning = torch.cat([_score(lines, inner, -2), position * (lines.conj() * inner).mean(-2).imag], -2)
         turn_std = std(_covariance(turning), hessian[..., 2 * channels :, :])
     misfit = std(over_bins, rows).square().sum(-1) / std(along, rows).square().sum(-1).clamp_min(tiny)
-    share = _blocks((cells.abs().square().mean((-3, -2)) - 10 ** (-snr_db[..., None] / 10)).clamp_min(0))
+    noise = weight * 10 ** (-snr_db[..., None] / 10)
+    share = _blocks((cells.abs().square().mean((-3, -2)) - noise).clamp_min(0))
     share = share / share.sum(-1, keepdim=True).clamp_min(tiny)
     # Balanced channels have equal power, but with a wrong prior other gains are more likely. It is
     # taken to be wrong where the powers differ by four times as much as by chance, by choice. Hann
     # weights leave 18 / 35 independent looks per pulse: (mean square)^2 / mean fourth power.
-    looks, level = lines.shape[-2] * lines.shape[-1] * 18 / 35, lines.abs().square().mean((-2, -1))
+    looks = (weight > 0).sum(-1, keepdim=True) * (lines.shape[-2] * 18 / 35)
+    level = lines.abs().square().mean((-2, -1))
     uneven = torch.log((level / level[..., reference, None].clamp_min(1e-300)).clamp_min(1e-3)).abs() / 2
     chance = model.chance(snr_db, reference, looks) / 2
     log_std = torch.where(uneven > 4.0 * chance, torch.hypot(log_std, uneven), log_std)
@@ -89,7 +93,7 @@ def assessed_balance(
     outcome = worst(
         (Outcome.INEXACT, ~(relative < 1)),
         (Outcome.MISFIT, misfit.sqrt() >= 2.5),
-        (Outcome.AMBIGUOUS, no_power if lead is None else lead * looks <= 100.0),
+        (Outcome.AMBIGUOUS, no_power if lead is None else lead * looks[..., 0] <= 100.0),
         (Outcome.TOO_FEW, share.square().sum(-1) * 3.0 >= 1),
         (Outcome.NOISE, phase_std.amax(-1) > 0.25),
         (Outcome.EMPTY, no_power),
@@ -98,16 +102,18 @@ def assessed_balance(
     return (phase_std, log_std, turn_std), (1 - relative).clamp(0, 1), outcome
 
 
-def _score(lines: Tensor, inner: Tensor, dim: int) -> Tensor:
+def _score(lines: Tensor, inner: Tensor, dim: int, weight: Tensor | float = 1.0) -> Tensor:
     """Return the gradient by logarithms and phases, averaged over `dim`, (..., 2 channel, n).
 
     Args:
         lines: Balanced lines, (..., channel, bin, cell).
         inner: Lines times the inverse of the model.
         dim: Dimension of bins or of cells.
+        weight: Expected power of the lines relative to that of the model, (..., n).
     """
     product = (lines.conj() * inner).mean(dim)
-    return torch.cat([product.real - 1, product.imag], -2)
+    expected = weight[..., None, :] if isinstance(weight, Tensor) else weight
+    return torch.cat([product.real - expected, product.imag], -2)
 
 
 def _blocks(values: Tensor, blocks: int = 32) -> Tensor:

@@ -166,6 +166,46 @@ class ClutterModel:
         found = solve(matrix[..., None, :, :], level * torch.polar(least.abs().clamp_min(0.1), least.angle()))
         return found.weights, 2 * found.cost + torch.linalg.slogdet(model)[1].mean(-1)
 
+    def homogeneous(self, cells: Tensor, no_power: Tensor, bins: int = 256, rounds: int = 8) -> Tensor:
+        """Return weights of range cells that leave out those that the model does not describe.
+
+        In such cells something moves, or another source is heard. The model is fitted to the cells
+        that are kept, and cells are left out whose power outside the clutter, summed over Doppler,
+        exceeds the median by six standard deviations, which are 1.48 times the median deviation of
+        a normal distribution, and is twice the median at least. This repeats until nothing changes.
+        Strong clutter does not count as power outside the clutter, where its bands are fewer than
+        the channels; with as many bands the whole whitened power counts.
+
+        Args:
+            cells: Doppler spectra of range cells, complex128 (..., channel, bin, cell).
+            no_power: Where a channel has no power (...,); all cells are then kept.
+            bins: About this many Doppler bins are compared.
+            rounds: Largest number of rounds.
+
+        Returns:
+            Weights of mean 1, zero where a cell is left out, float64 (..., cell).
+        """
+        step = max(1, cells.shape[-2] // bins)
+        thin, x = ClutterModel(self.response[::step], self.power[::step]), cells[..., ::step, :].movedim(-3, -2)
+        kept = torch.ones_like(x[..., 0, 0, :].real)
+        eye = torch.eye(x.shape[-2], dtype=x.dtype, device=x.device)
+        for _ in range(rounds):
+            products = (x * kept[..., None, None, :]) @ x.mH / kept.sum(-1)[..., None, None, None]
+            products = torch.where(no_power[..., None, None, None], eye, products)
+            snr_db = thin.snr_db(products)
+            weighted = x * thin.weights(products, snr_db)[0][..., None, :, None]
+            # far above the noise, so that clutter of any strength has little whitened power
+            inner = matrix_inverse(thin.noisy(snr_db + 30.0)) @ weighted
+            power = (weighted.conj() * inner).real.sum((-3, -2))
+            known = power.masked_fill(kept == 0, torch.nan)
+            middle = known.nanmedian(-1, keepdim=True).values
+            spread = 1.4826 * (known - middle).abs().nanmedian(-1, keepdim=True).values
+            new = ((power <= middle + torch.maximum(6.0 * spread, middle)) | no_power[..., None]).to(kept.dtype)
+            if torch.equal(new, kept):
+                break
+            kept = new
+        return kept / kept.mean(-1, keepdim=True)
+
     def fit(self, products: Tensor, snr_db: Tensor | float, position: Tensor | None) -> Fit:
         """Fit weights, and turns if there is a position, for a given SNR.
 
@@ -214,13 +254,13 @@ class ClutterModel:
         levels, _ = grid_minimum(cost, centre, 57.0, 20)
         return parabola_minimum(cost, levels, 2.0, 0.1, rounds=4)[0]
 
-    def chance(self, snr_db: Tensor, reference: int, looks: float) -> Tensor:
+    def chance(self, snr_db: Tensor, reference: int, looks: Tensor) -> Tensor:
         """Return by how much the powers of balanced channels differ from the reference by chance.
 
         Args:
             snr_db: SNR, shape (...,).
             reference: Index of the reference channel.
-            looks: Number of independent samples in all bins.
+            looks: Number of independent samples in all bins, (..., 1).
 
         Returns:
             Standard deviations relative to the power, shape (..., channel).
