@@ -43,6 +43,7 @@ class Outcome(IntEnum):
     TOO_FEW = 19
     IN_DOUBT = 20
     UNSPECIFIED = 21
+    UNBALANCED = 22
     NOISE = 30
     SINGULAR = 31
     EMPTY = 32
@@ -102,6 +103,7 @@ _MESSAGES = {
     Outcome.TOO_FEW: "too few pulses, range cells or scatterers to judge the estimate: use more data",
     Outcome.IN_DOUBT: "an estimate on which this one depends is doubtful",
     Outcome.UNSPECIFIED: "not reliable, for a reason that was not given",
+    Outcome.UNBALANCED: "the channels differ in phase, gain or delay: balance them first (estimate_balance)",
     Outcome.NOISE: "nothing rises above the noise: raise the SNR, or use more pulses or range cells",
     Outcome.SINGULAR: "the data do not determine the values: use more of them, or fewer unknowns",
     Outcome.EMPTY: "there are no samples other than zero",

@@ -17,19 +17,20 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from torchsar.core import Estimate, Outcome, Signal, Stage, fft_lines, linear_phasor
+from torchsar.multichannel.balance import estimate_balance
 from torchsar.multichannel.body import Body, body_echo, body_image, find_body, known_body
 from torchsar.multichannel.chip import Extraction
 from torchsar.multichannel.detection import Detection, detect
 from torchsar.multichannel.migration import Frame
 from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.reconstruct import LeastSquares, Rebuild
-from torchsar.multichannel.response import band_matrix, first_bin, shared_response
+from torchsar.multichannel.reconstruct import LeastSquares, MinimumMeanSquare, Rebuild
+from torchsar.multichannel.response import FlatBand, band_matrix, first_bin, shared_response
 from torchsar.multichannel.stationary import StationaryImage, stationary_axis
 from torchsar.multichannel.velocity.whitening import line_whitening
 from torchsar.radar import BistaticRadar
@@ -94,20 +95,23 @@ class SceneImage:
     (('azimuth', 'range'), 0)
 
     Args:
-        conventional: Image (azimuth, range) of all data as if the whole scene were stationary.
+        conventional: Image (..., azimuth, range) of all data as if the whole scene were stationary.
         rest: Image of the data without the moving targets.
         fused: Image `rest` with every moving target at its true position.
-        bodies: All targets, strongest first.
-        estimate: `u_r_m_s`, `u_a_m_s`, `y0_m`, `range_m` of the targets. Each has as many entries
-            as the detector may find targets (`Detector.most`); entries without a target are zero,
-            and `ok` is False there.
+        bodies: All targets, strongest first; with trials, a list of them for each trial, in the
+            order of the flattened trials.
+        estimate: `u_r_m_s`, `u_a_m_s`, `y0_m`, `range_m` of the targets, (..., target). Each has as
+            many entries as the detector may find targets (`Detector.most`); entries without a
+            target are zero, and their outcome is `NOISE`. Outcomes of targets are those of `Body`,
+            or `UNBALANCED` where the stationary clutter shows that the channels differ by as much
+            as a slant-range speed of 0.3 m/s.
         data: Channels from which the moving targets were removed.
     """
 
     conventional: Signal
     rest: Signal
     fused: Signal
-    bodies: list[Body]
+    bodies: list[Any]
     estimate: Estimate
     data: Signal
 
@@ -125,9 +129,8 @@ class ImageMovers(Stage):
     >>> [int(x.data.abs().amax(-1).argmax()) for x in (images.conventional, images.fused)]
     [280, 160]
 
-    The channels (channel, pulse, range) are range compressed, and the transmit range has been
-    removed from their phase. One recording is processed at a time, since the number of targets
-    differs between recordings.
+    The channels (channel, pulse, range) are range compressed and balanced, and the transmit range
+    has been removed from their phase.
 
     Args:
         radar: Radar parameters.
@@ -140,6 +143,8 @@ class ImageMovers(Stage):
         slowest_m_s: Least slant-range and least along-track speed in m/s. A target that exceeds one
             of them counts as moving; other targets stay in the image as stationary ones.
         u_a_half_m_s: Half width of the search in the along-track speed u_a in m/s.
+        assess: Whether the outcomes of the targets are reported. A target is removed and focused
+            again only if its motion is reliable, with either value.
 
     Raises:
         ValueError: If `removal` is unknown, or there are too few channels for the bands.
@@ -156,38 +161,35 @@ class ImageMovers(Stage):
         removal: Removal = "subtract",
         slowest_m_s: tuple[float, float] = (0.3, 1.0),
         u_a_half_m_s: float = 20.0,
+        *,
+        assess: bool = True,
     ) -> None:
         super().__init__()
         if removal not in ("subtract", "zero"):
             raise ValueError(f"removal must be 'subtract' or 'zero', got {removal!r}")
         self.radar, self.extraction, self.detector = radar, extraction or Extraction(), detector or Detector()
         self.image, self.removal = StationaryImage(radar, rebuild or LeastSquares()), removal
-        self.slowest_m_s, self.u_a_half_m_s = slowest_m_s, u_a_half_m_s
+        self.slowest_m_s, self.u_a_half_m_s, self.assess = slowest_m_s, u_a_half_m_s, assess
 
     def forward(self, signal: Signal, known: Sequence[PointMotion] | None = None) -> SceneImage:
-        """Image one recording with its moving targets.
+        """Image recordings with their moving targets.
 
         A warning is given if the swath is too narrow for any target to be detected.
 
         Args:
-            signal: Channels with the axes (channel, pulse, range), without trials.
+            signal: Channels with the axes (channel, pulse, range).
             known: Motions of the middles of all targets, strongest first, if they are known a
-                priori. No targets are then detected. None to detect the targets in the images.
+                priori; their values have the shape of the trials, or broadcast to it. No targets
+                are then detected. None to detect the targets in the images.
 
         Returns:
             The images and the targets.
 
         Raises:
-            ValueError: If the signal has trials, more motions are known than the detector allows,
-                or as in `StationaryImage.forward` and `chip_about`.
+            ValueError: If more motions are known than the detector allows, or as in
+                `StationaryImage.forward` and `chip_about`.
         """
-        if signal.trials:
-            raise ValueError(
-                "ImageMovers works on one frame at a time, got data with the trial dimensions "
-                f"{tuple(signal.trials)}; call it for each trial separately"
-            )
-        conventional = self.image(signal)
-        axis = signal.axis("range")
+        axis, trials = signal.axis("range"), signal.trials
         if known is None and not self._inside_frame(
             Detection(0.0, axis.start + axis.step * (axis.n // 2), 0.0), signal
         ):
@@ -196,18 +198,36 @@ class ImageMovers(Stage):
                 "exceeds the swath; give more lines, or a smaller extraction",
                 stacklevel=3,
             )
+        made = []
+        for i, data in enumerate(signal.data.reshape(-1, *signal.data.shape[-3:])):
+            own = None if known is None else [motion.each(partial(_of_trial, trials, i)) for motion in known]
+            left, found = self._extracted(Signal(data, signal.axes), own)
+            rest = fused = self.image(left)
+            for body in filter(self._moves, found):
+                fused = placed(fused, body, self.extraction)
+            made.append((found, self.image(Signal(data, signal.axes)), rest, fused, left))
+        bodies, *parts = zip(*made, strict=True)
+        conventional, rest, fused, data = (
+            Signal(torch.stack([x.data for x in of]).unflatten(0, trials) if trials else of[0].data, of[0].axes)
+            for of in parts
+        )
+        estimate = Estimate.joined([self._estimate(found, signal.data) for found in bodies], trials)
+        if self.assess and any(bodies):
+            unequal = unbalanced(signal.data, self.radar, self.image.rebuild)[..., None]
+            outcome = torch.where(unequal, estimate.outcome.clamp_min(Outcome.UNBALANCED), estimate.outcome)
+            estimate = replace(estimate, outcome=outcome)
+        return SceneImage(conventional, rest, fused, list(bodies) if trials else bodies[0], estimate, data)
+
+    def _extracted(self, remaining: Signal, known: Sequence[PointMotion] | None) -> tuple[Signal, list[Body]]:
+        """Return the data of one trial without its moving bodies, and all bodies."""
         if known is not None:
-            remaining, bodies = self._extract_known(signal, known)
-        else:
-            remaining, bodies = self._extract_detected(signal, self.image, [])
-            if self.detector.suppressed_m_s:
-                speeds_m_s = self.detector.suppressed_m_s
-                shown = partial(suppressed_image, radar=self.radar, image=self.image, speeds_m_s=speeds_m_s)
-                remaining, bodies = self._extract_detected(remaining, shown, bodies)
-        rest = fused = self.image(remaining)
-        for body in filter(self._moves, bodies):
-            fused = placed(fused, body, self.extraction)
-        return SceneImage(conventional, rest, fused, bodies, self._estimate(bodies, signal.data), remaining)
+            return self._extract_known(remaining, known)
+        remaining, bodies = self._extract_detected(remaining, self.image, [])
+        if self.detector.suppressed_m_s:
+            speeds_m_s = self.detector.suppressed_m_s
+            shown = partial(suppressed_image, radar=self.radar, image=self.image, speeds_m_s=speeds_m_s)
+            remaining, bodies = self._extract_detected(remaining, shown, bodies)
+        return remaining, bodies
 
     def _extract_detected(self, remaining: Signal, image_of, bodies: list[Body]) -> tuple[Signal, list[Body]]:
         """Detect targets and remove those that move, strongest first, until none is new."""
@@ -316,29 +336,68 @@ class ImageMovers(Stage):
         return signal.with_data(data)
 
     def _estimate(self, bodies: list[Body], like: Tensor) -> Estimate:
-        """Form the estimate of all targets, padded to the `most` of the detector."""
+        """Form the estimate of all targets, padded to the `most` of the detector, (1, target)."""
         most = self.detector.most
 
         def row(values: list[Tensor]) -> Tensor:
             kept = torch.stack(values) if values else like.real.new_zeros(0, dtype=torch.float64)
-            return torch.cat(
-                [kept.to(torch.float64), torch.zeros(most - len(kept), dtype=torch.float64, device=like.device)]
-            )
+            rest = torch.zeros(most - len(kept), dtype=torch.float64, device=like.device)
+            return torch.cat([kept.to(torch.float64), rest])[None]
 
-        value = {
-            name: row([getattr(body.motion, name) for body in bodies])
-            for name in ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")
-        }
+        names = ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")
+        value = {name: row([getattr(body.motion, name) for body in bodies]) for name in names}
         missing = row([torch.ones_like(body.level) for body in bodies]) == 0
-        outcome = row([body.outcome for body in bodies]).long().masked_fill(missing, Outcome.NOISE)
+        outcome = row([body.outcome for body in bodies]).long()
+        if not self.assess:
+            outcome = Outcome.NOT_ASSESSED.like(outcome)
         level = row([body.level for body in bodies])
         return Estimate(
             value,
             {"u_r_m_s": row([body.u_r_std_m_s for body in bodies])},
             level / (100.0 + level),  # convention: one half at 20 dB
-            outcome,
+            outcome.masked_fill(missing, Outcome.NOISE),
             info={"level": level},
         )
+
+
+def _of_trial(trials: torch.Size, i: int, x: Tensor) -> Tensor:
+    """Value () of one trial of a value that broadcasts to the trials."""
+    return x.expand(trials).reshape(-1)[i]
+
+
+def unbalanced(data: Tensor, radar: BistaticRadar, rebuild: Rebuild, most_m_s: float = 0.3) -> Tensor:
+    """Test whether stationary clutter shows that the channels are not balanced.
+
+    The channels are balanced once more. They count as unbalanced if the clutter determines their
+    differences, and one of them, in radians or nepers, is as large as the phase that a slant-range
+    speed causes over the array, and exceeds four standard deviations. Clutter that does not
+    determine the differences shows nothing.
+
+    Args:
+        data: Range-compressed channels with the transmit range removed, shape (..., channel, pulse,
+            range), complex.
+        radar: Radar parameters.
+        rebuild: Reconstruction method, which says what Doppler bands the clutter is expected in.
+        most_m_s: The slant-range speed in m/s; by default, the deviation from which on the speed of
+            a target is `INEXACT`.
+
+    Returns:
+        True where they are not balanced, bool (...,).
+    """
+    prior = rebuild.prior if isinstance(rebuild, MinimumMeanSquare) else FlatBand(rebuild.bands * radar.prf_hz)
+    bands = math.ceil(prior.bandwidth_hz / radar.prf_hz) if isinstance(prior, FlatBand) else None
+    inside = int(data.shape[-1] * radar.pulse.bandwidth_hz / radar.sampling_hz)
+    found = estimate_balance(data, radar, prior, bands, blocks=min(16, inside))
+    reach_m = max(radar.channel_m) - min(radar.channel_m)
+    least = math.pi * reach_m * most_m_s / (radar.wavelength_m * radar.speed_m_s)
+    # phases that a delay turns over the band, in the rms
+    scales = {
+        "phase_rad": 1.0,
+        "gain_db": math.log(10) / 20,
+        "delay_s": math.pi * radar.pulse.bandwidth_hz / math.sqrt(3),
+    }
+    off = [(scale * found[k].abs() > least) & (found[k].abs() > 4.0 * found.std[k]) for k, scale in scales.items()]
+    return found.ok & torch.stack(off).any(0).any(-1)
 
 
 class MoversImage(Stage):
@@ -355,7 +414,7 @@ class MoversImage(Stage):
     >>> images(recording.signal, **{n: truth.values[n] for n in images.provides})[1]["u_r_m_s"]
     tensor([6., 0.], dtype=torch.float64)
 
-    It applies `ImageMovers` to each trial. Its outputs are the image with every moving target at
+    It applies `ImageMovers`. Its outputs are the image with every moving target at
     its true position, and an estimate of the motions.
 
     Args:
@@ -384,9 +443,8 @@ class MoversImage(Stage):
         assess: bool = True,
     ) -> None:
         super().__init__()
-        self.flow = ImageMovers(radar, extraction, detector, rebuild, removal, u_a_half_m_s=u_a_half_m_s)
+        self.flow = ImageMovers(radar, extraction, detector, rebuild, removal, u_a_half_m_s=u_a_half_m_s, assess=assess)
         self.neutral = {**dict.fromkeys(self.provides, 0.0), "range_m": radar.reference_range_m}
-        self.assess = assess
 
     def forward(
         self,
@@ -420,24 +478,11 @@ class MoversImage(Stage):
                 "known targets need all of u_r_m_s, u_a_m_s, y0_m and range_m, got only some of them; "
                 "connect all four, or none to detect the targets"
             )
-        frames = signal.data.reshape(-1, *signal.data.shape[-3:])
-        known = [x.to(torch.float64).expand(*signal.trials, x.shape[-1]).reshape(len(frames), -1) for x in values]
-        made = []
-        for frame, *of_frame in zip(frames, *known, strict=True):
-            pairs = zip(*of_frame, strict=True)
-            motions = [PointMotion.of(self.flow.radar, frame.real, *pair) for pair in pairs] if known else None
-            made.append(self.flow(Signal(frame, signal.axes), motions))
-        parts = []
-        for one in made:
-            info = {**one.estimate.info, "rest": one.rest.data, "conventional": one.conventional.data}
-            tables = (one.estimate.value, one.estimate.std, info)
-            value, std, info = ({name: x[None] for name, x in table.items()} for table in tables)
-            outcome = one.estimate.outcome[None]
-            if not self.assess:
-                outcome = torch.where(info["level"] > 0, Outcome.NOT_ASSESSED, outcome)
-            parts.append(Estimate(value, std, one.estimate.quality[None], outcome, info))
-        fused = torch.stack([one.fused.data for one in made]).view(*signal.trials, *made[0].fused.data.shape)
-        return Signal(fused, made[0].fused.axes), Estimate.joined(parts, signal.trials)
+        known = zip(*(x.to(torch.float64).unbind(-1) for x in values), strict=True) if values else None
+        motions = None if known is None else [PointMotion.of(self.flow.radar, signal.data.real, *of) for of in known]
+        made = self.flow(signal, motions)
+        info = {**made.estimate.info, "rest": made.rest.data, "conventional": made.conventional.data}
+        return made.fused, replace(made.estimate, info=info)
 
 
 def suppressed_image(
