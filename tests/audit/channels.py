@@ -18,6 +18,7 @@ from torchsar.core import Draws, Estimate, Signal
 from torchsar.echo import simulate_bistatic
 from torchsar.multichannel import (
     AlongTrackAutofocus,
+    ClutterSynchronisation,
     CompressChannels,
     Detector,
     Dwell,
@@ -326,6 +327,25 @@ def moving_only(trials: int, seed: int) -> Batch:
     return Batch(batch.data, {"phase_rad": torch.zeros(trials, 3, dtype=F64)})
 
 
+def drifting_clutter(
+    snr_db: float, power: Callable[[Tensor], Tensor], moving: float = 0.0
+) -> Callable[[int, int], Batch]:
+    """Draw clutter with a clock phase that bends, and a moving point of some amplitude."""
+
+    def draw(trials: int, seed: int) -> Batch:
+        still = clutter(power, snr_db)(trials, seed)
+        signal, errors = still.data, still.truth or {}
+        data = correct_balance(signal.data, RADAR, errors["phase_rad"], errors["gain_db"], errors["delay_s"])
+        if moving:
+            data = data + moving * compressed_echo(RADAR, 256, 96, [{"u_r": 8.0}]).data
+        t = torch.linspace(-1, 1, 256, dtype=F64)
+        bend = 10 * Draws(seed + 3, trials=range(trials)).uniform("bend", (), -1, 1)[:, None] * (t.square() - 1 / 3)
+        data = data * torch.exp(1j * bend)[:, None, :, None]
+        return Batch(signal.with_data(data), {"phase_rad": bend})
+
+    return draw
+
+
 def direct_path(snr_db: float, drift_s: float = 2e-8) -> Callable[[int, int], Batch]:
     """Draw direct paths of a random phase and a drifting delay, summed over frequency."""
 
@@ -472,6 +492,17 @@ def entries() -> list[Entry]:
                 World("other beam", clutter(flat, 20.0, radar=FIVE), 20.0),
             ],
             balance,
+        ),
+        Entry(
+            "multichannel.ClutterSynchronisation",
+            ClutterSynchronisation(RADAR, 337.5),
+            [
+                *nothing((3, 256, 96), lambda x: Signal(x, RADAR.axes(256, 96))),
+                *(World("own", drifting_clutter(snr, flat), snr) for snr in SNR_DB),
+                World("moving point", drifting_clutter(20.0, flat, 20.0), 20.0),
+                World("other beam", drifting_clutter(20.0, beam), 20.0),
+            ],
+            [Quantity("phase_rad", 0.5, circular, 0.05)],
         ),
         Entry(
             "multichannel.EstimateSynchronisation",

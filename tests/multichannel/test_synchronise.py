@@ -8,8 +8,14 @@ import pytest
 import torch
 
 from tests.multichannel.helpers import compressed_echo, published_radar
+from tests.multichannel.test_balance import clutter, flat
 from torchsar.core import Signal
-from torchsar.multichannel import CompressChannels, EstimateSynchronisation, RemoveSynchronisation
+from torchsar.multichannel import (
+    ClutterSynchronisation,
+    CompressChannels,
+    EstimateSynchronisation,
+    RemoveSynchronisation,
+)
 from torchsar.multichannel.synchronise import estimate_synchronisation, remove_synchronisation
 
 RADAR = published_radar()
@@ -98,6 +104,28 @@ def test_phase_and_delay_are_removed_from_all_channels():
         lambda d, p, t: remove_synchronisation(d, RADAR, p, t * 1e-9),
         (small, values[0], (values[1] * 1e9).detach().requires_grad_()),
     )
+
+
+def test_what_is_at_rest_shows_the_clock_phase():
+    data = clutter(RADAR, flat, 30.0, trials=3, n_range=96)
+    data[1] += 3 * compressed_echo(RADAR, 256, 96, [{"u_r": 8.0}]).data
+    t = torch.linspace(-1, 1, 256, dtype=torch.float64)
+    phase = 6 * t.square() + torch.tensor([0.0, 0.0, 3.0])[:, None] * t + 4
+    drifting = Signal(data * torch.exp(1j * phase)[:, None, :, None], RADAR.axes(256, 96))
+    found = ClutterSynchronisation(RADAR, 320.0)(drifting)
+    assert bool(found.ok.all())
+    error = found["phase_rad"] - 6 * (t.square() - t.square().mean())
+    assert float(error.square().mean(-1).sqrt().max()) < 0.15 and bool((error.abs() < 6 * found.std["phase_rad"]).all())
+    slope = (found["phase_rad"] * t).mean(-1)
+    torch.testing.assert_close(torch.stack([slope, found["phase_rad"].mean(-1)]), torch.zeros(2, 3).double())
+    alone = ClutterSynchronisation(RADAR, 320.0)(drifting.with_data(drifting.data[1]))
+    torch.testing.assert_close(alone["phase_rad"], found["phase_rad"][1])
+    noise = torch.randn(2, 3, 256, 96, dtype=torch.complex64, generator=torch.Generator().manual_seed(2))
+    assert bool(ClutterSynchronisation(RADAR, 320.0)(drifting.with_data(noise)).failed.all())
+    with pytest.raises(ValueError, match="must be positive, got 0 Hz and 0.25 s"):
+        ClutterSynchronisation(RADAR, 0.0)(drifting)
+    with pytest.raises(ValueError, match="at least 2 channels and 4 pulses, got 3 and 2"):
+        ClutterSynchronisation(RADAR, 320.0)(compressed_echo(RADAR, 2, 16, [{}]))
 
 
 def test_refusals():

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 
-from tests.study.scenes import GEO_OCEAN, SHIP, bench_of, world
+from tests.study.scenes import FLOW, GEO_OCEAN, SHIP, bench_of, world
 from torchsar.core import Axis, Draws, Signal
 from torchsar.multichannel.motion import PointMotion
 from torchsar.study.commands.requires import refuse_beyond_limits
+from torchsar.study.systems.geo_ocean import figures
 from torchsar.study.systems.geo_ocean.judge import ImagePosition
 from torchsar.study.table import load
 from torchsar.study.trials.bench import Bench
@@ -39,6 +41,86 @@ def test_every_ship_is_measured(tmp_path: Path) -> None:
     assert float(whole["noise_gain_db"]) < 0.6
     found = bench.system.found(bench, outcomes["recommended"], bench.trials(Draws(1, "run", [0])))
     assert float(found["one.u_r_m_s"].value) == pytest.approx(8 + best["u_r_error_m_s"])
+
+
+TRANSMIT = {"transmit": {"stage": "remove_transmit_range"}}
+BALANCE = {
+    "differences": {"stage": "estimate_balance", "prior": {"kind": "flat_band", "bandwidth_hz": 180.0}, "bands": 1},
+    "balance": {
+        "stage": "correct_balance",
+        "uses": dict.fromkeys(("phase_rad", "gain_db", "delay_s"), "differences"),
+    },
+}
+DIRECT = {
+    "drift": {"stage": "estimate_synchronisation", "uses": {"direct_path": "aux.direct_path"}},
+    "clocks": {"stage": "remove_synchronisation", "uses": {"phase_rad": "drift", "delay_s": "drift"}},
+}
+AT_REST = {
+    "drift": {"stage": "clutter_synchronisation", "band_hz": 180.0},
+    "clocks": {"stage": "remove_synchronisation", "uses": {"phase_rad": "drift"}},
+}
+ERRORS = {
+    "channels": {
+        "kind": "channel_errors",
+        "phase_rad": [0.6, 0.0, -0.9],
+        "gain_db": [0.8, 0.0, -1.1],
+        "delay_s": [1.5e-9, 0.0, -2e-9],
+    },
+    "clocks": {
+        "kind": "synchronisation_error",
+        "phase_rad": [0.3, 1.0, 0.8],
+        "phase_sinusoid_rad": 1.0,
+        "delay_sinusoid_s": 3e-9,
+        "direct_snr_db": 30.0,
+    },
+}
+
+
+@pytest.mark.slow
+def test_errors_of_clocks_and_channels_are_removed(tmp_path: Path) -> None:
+    """The sea fills a Doppler band; more of them, as published, take minutes."""
+    image = {**FLOW, "integration_s": 2.35, "bands": 1, "threshold_db": 13.0}
+    chains = {
+        "uncorrected": {**TRANSMIT, **DIRECT},
+        "at_rest": {**TRANSMIT, **BALANCE, **AT_REST},
+        "recommended": {**TRANSMIT, **DIRECT, **BALANCE},
+    }
+    processor = {name: {"stages": {**stages, "image": image}} for name, stages in chains.items()}
+    scene = {
+        "samples": 160,
+        "gate": {"kind": "band_limited", "duration_s": 2.35},
+        "targets": {
+            "one": {**SHIP, "scr_db": 10.0},
+            "still": {**SHIP, "u_r_m_s": 0.0, "scr_db": 10.0, "range_m": -60.0},
+        },
+    }
+    alone = {"recommended": {"stages": {**TRANSMIT, "image": image}}}
+    right, bench = (
+        bench_of(
+            tmp_path, "geo_ocean", world=world("geo_ocean", **scene, impairments=errors), processor=of, metrics=None
+        )
+        for errors, of in (({}, alone), (ERRORS, processor))
+    )
+    draws = Draws(1, "run", [0, 1])
+    true, batch = right.batch(draws).outcomes["recommended"], bench.batch(draws, detail=True)
+    assert not bool(batch.outcomes["uncorrected"].metrics["ok"].any())
+    for name, near_m in (("recommended", 2.0), ("at_rest", 3.0)):
+        outcome = batch.outcomes[name]
+        assert bool(outcome.metrics["ok"].all()), name
+        for key, most in (
+            ("u_r_error_m_s", 0.1),
+            ("u_a_error_m_s", 0.1),
+            ("along_error_m", near_m),
+            ("range_error_m", 2.0),
+        ):
+            for ship, own in true.judged.targets.items():
+                off = outcome.judged.targets[ship][key] - own[key]
+                assert float(off.abs().max()) < most, (name, ship, key, off)
+    result = SimpleNamespace(bench=bench, first=batch)
+    ((_, _, _, panels),) = figures._flow(result)  # pyright: ignore[reportArgumentType]
+    titles = [panel.axes[0].get_title() for panel in panels]
+    assert titles[:4] == ["after transmit", "after clocks", "one channel", "everything at rest"]
+    assert titles[4:] == ["detected", "without moving ships", "fused"]
 
 
 def test_what_is_not_found_counts_as_at_rest(tmp_path: Path) -> None:

@@ -513,6 +513,15 @@ CASES = [
     ),
     Case("correct_balance", lambda: multichannel.CorrectBalance(BISTATIC), _balance, channels="range"),
     Case(
+        "clutter_synchronisation",
+        lambda: multichannel.ClutterSynchronisation(BISTATIC, 300.0),
+        differentiable=False,
+        vmap=False,
+        tolerance=1e-6,
+        channels="range",
+        laws=RANGE_FREE,
+    ),
+    Case(
         "estimate_synchronisation",
         lambda: multichannel.EstimateSynchronisation(BISTATIC),
         _direct_path,

@@ -12,9 +12,9 @@ before data are processed          `multichannel_limits`, `multichannel_requirem
 range compression, transmit range  `CompressChannels`; `remove_transmit_range`, as published
                                    `AzimuthScaling`
 errors of channels and clocks      `estimate_balance`, `correct_balance`; `EstimateSynchronisation`,
-                                   `RemoveSynchronisation`
+                                   `ClutterSynchronisation`, `RemoveSynchronisation`
 image of a stationary scene        `stationary_image`
-scene and its moving targets       `MoversImage` in chains; `ImageMovers` of one recording gives a
+scene and its moving targets       `MoversImage` in chains; `ImageMovers` in programs gives a
                                    `SceneImage`; settings `Detector`, `Extraction`
 bright targets of an image         `detect`
 velocity of a moving point         `moving_point_velocity`, within a `Search`
@@ -65,7 +65,7 @@ from torchsar.multichannel.requirements import MultichannelUse, multichannel_req
 from torchsar.multichannel.response import ElementPattern, FlatBand, doppler_offsets
 from torchsar.multichannel.scene_image import Detector, ImageMovers, MoversImage, SceneImage
 from torchsar.multichannel.stationary import StationaryImage, stationary_image
-from torchsar.multichannel.synchronise import EstimateSynchronisation, RemoveSynchronisation
+from torchsar.multichannel.synchronise import ClutterSynchronisation, EstimateSynchronisation, RemoveSynchronisation
 from torchsar.multichannel.transmit import (
     AzimuthScaling,
     CompressChannels,
@@ -89,6 +89,7 @@ from torchsar.multichannel.velocity.walk import MigratingLines, WalkAmbiguity
 __all__ = [
     "AlongTrackAutofocus",
     "AzimuthScaling",
+    "ClutterSynchronisation",
     "CompressChannels",
     "CorrectBalance",
     "CorrectMigration",

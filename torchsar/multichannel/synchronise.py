@@ -1,13 +1,18 @@
-"""Phase and time synchronisation of transmitter and receiver by the direct-path signal.
+"""Phase and time synchronisation of transmitter and receiver.
 
 The signal of the satellite also reaches the receiver directly. Its range is known from the
 ephemeris, so that the residual phase and delay after compression are the errors of the clocks, one
 of each per pulse, common to all channels. The estimator is that of maximum likelihood for one echo
 of a known band.
 
+Without a direct path, what is at rest shows the phases. A channel passes nearly the places at which
+another one was a pulse before, so that the channels predict the echo of what is at rest from pulse
+to pulse, whatever the scene is; the phase that is left is the drift of the clocks.
+
 Reference:
     Remote Sens. 2020, 12, 1703, sections 1 and 2.1, which describe the direct-path reference
-    channel without an estimator.
+    channel, and strong islands and ships at rest as its substitute, without an estimator;
+    Bellettini and Pinto 2002 (displaced phase centres, for the path of a synthetic aperture sonar).
 """
 
 from __future__ import annotations
@@ -17,9 +22,10 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Outcome, Signal, unit_phasor, worst
+from torchsar.core import Estimate, Outcome, Signal, Stage, matrix_inverse, unit_level, unit_phasor, worst
 from torchsar.multichannel.balance import without_errors
-from torchsar.multichannel.channels import ChannelStage, refuse_other_count
+from torchsar.multichannel.channels import ChannelStage, checked_channels, refuse_other_count
+from torchsar.multichannel.chip import TINY
 from torchsar.radar import BistaticRadar
 
 
@@ -98,6 +104,119 @@ def _refined_delay(band: Tensor, frequency: Tensor, start: Tensor, steps: int = 
     return delay
 
 
+def estimate_clutter_synchronisation(
+    data: Tensor,
+    radar: BistaticRadar,
+    band_hz: float,
+    block_s: float = 0.25,
+    snr_db: float = 30.0,
+    *,
+    assess: bool = True,
+) -> Estimate:
+    """Estimate the clock phase of each pulse from the echo of what is at rest.
+
+    Every range cell counts in blocks of slow time by how well each pulse predicts the next one:
+    most of all bright places at rest, such as islands and ships at anchor, but also a sea far above
+    the noise. Cells in which something moves are badly predicted and hardly count. A constant phase
+    cannot be determined, and a phase that grows linearly with time displaces the whole scene along
+    track: both are left out. Not differentiable.
+
+    Args:
+        data: Range-compressed, balanced channels with the transmit range removed from the phase,
+            shape (..., channel, pulse, range), complex.
+        radar: Radar parameters.
+        band_hz: Doppler bandwidth in Hz of what is at rest, about zero.
+        block_s: Length in seconds of the blocks.
+        snr_db: Power of what is at rest over the noise in dB, for the prediction.
+        assess: Whether quality and outcome are assessed.
+
+    Returns:
+        `phase_rad` (..., pulse), whose line of least squares is zero, with one standard deviation
+        for all pulses, by the scatter between four parts of the range cells. Outcomes: `INEXACT`
+        where it exceeds 0.3 rad, `NOISE` where it exceeds 1 rad.
+
+    Raises:
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, a sample is not finite, or the channels are not those
+            of the radar, or if the radar has one channel, there are fewer than 4 pulses, or
+            `band_hz` or `block_s` is not positive.
+    """
+    data = checked_channels(data, radar, "estimate_clutter_synchronisation", "channel, pulse, range")
+    pulses = data.shape[-2]
+    if radar.channels < 2 or pulses < 4:
+        raise ValueError(
+            "estimate_clutter_synchronisation compares channels in successive pulses, and needs at least 2 channels "
+            f"and 4 pulses, got {radar.channels} and {pulses}"
+        )
+    if not (band_hz > 0 and block_s > 0):
+        raise ValueError(
+            "band_hz, the Doppler bandwidth of what is at rest, and block_s must be positive, got "
+            f"{band_hz:g} Hz and {block_s:g} s"
+        )
+    with torch.no_grad():
+        later, earlier = _predicted(unit_level(data, 3), radar, band_hz, snr_db)
+        block = torch.arange(pulses - 1) // max(1, round(block_s * radar.prf_hz))
+        power, fit = (_block_sums(x.abs().square().sum(-3), block) for x in (later, earlier))
+        product = (later * earlier.conj()).sum(-3)
+        weight, turn = 1 / power.clamp_min(TINY), product[..., 0]
+        for _ in range(6):  # further rounds change the phases by less than a tenth of their deviation
+            turn = torch.sgn((weight[..., block, :] * product).sum(-1))
+            error = power + fit - 2 * _block_sums((product * turn[..., None].conj()).real, block)
+            # falls with the cube of the error: cells that move by a part of a wavelength in a
+            # pulse would bias the phases otherwise
+            weight = (power - error).clamp_min(0).square() / error.clamp_min(TINY) ** 3
+        phase = _phase_without_line(turn)
+        if not assess:
+            return Estimate({"phase_rad": phase}, outcome=Outcome.NOT_ASSESSED.like(phase[..., 0]))
+        # the deviation by four parts of the range cells; neighbouring cells are alike
+        parts, cell = 4, torch.arange(data.shape[-1], device=data.device)
+        sums = torch.zeros(*turn.shape, parts, dtype=product.dtype, device=data.device)
+        sums = sums.index_add(-1, cell // 8 % parts, (weight[..., block, :] * product).to(sums)).movedim(-1, -2)
+        off = _phase_without_line(torch.sgn(sums)) - phase[..., None, :]
+        std = (off.square().sum(-2).mean(-1) / (parts * (parts - 1))).sqrt()
+        std = torch.where((sums == 0).any(-1).any(-1), torch.inf, std).clamp_max(1e3)
+    outcome = worst((Outcome.INEXACT, ~(std <= 0.3)), (Outcome.NOISE, ~(std <= 1.0)))
+    spread = std[..., None].expand_as(phase)
+    return Estimate({"phase_rad": phase}, {"phase_rad": spread}, (1 - std).clamp(0, 1), outcome)
+
+
+def _phase_without_line(turn: Tensor) -> Tensor:
+    """Return phases (..., pulse) by the phasors (..., pulse - 1) of their steps, without a line."""
+    step = torch.angle(turn * torch.sgn(turn.sum(-1, keepdim=True)).conj())
+    phase = torch.nn.functional.pad(step.to(torch.float64).cumsum(-1), (1, 0))
+    time = torch.linspace(-1, 1, phase.shape[-1], dtype=torch.float64, device=turn.device)
+    slope = (phase * time).sum(-1, keepdim=True) / time.square().sum()
+    return phase - phase.mean(-1, keepdim=True) - slope * time
+
+
+def _predicted(data: Tensor, radar: BistaticRadar, band_hz: float, snr_db: float) -> tuple[Tensor, Tensor]:
+    """Return pulses and their predictions from the pulse before, whitened.
+
+    Both have the shape (..., channel, n - 1, range). The covariance of two channels is that of a
+    flat Doppler spectrum at the distance of the places at which they receive: the channel at dx
+    lies dx behind, and all move on by the way of the receiver in a pulse interval.
+    """
+    at, per_pulse_m = radar.channels_at(data.device), radar.speed_m_s / radar.prf_hz
+    apart_m = at - at[:, None]
+    same, next_ = (torch.sinc(band_hz * x / radar.speed_m_s) for x in (apart_m, apart_m + per_pulse_m))
+    eye = torch.eye(len(at), dtype=torch.float64, device=data.device)
+    linear = next_ @ matrix_inverse(same + 10 ** (-snr_db / 10) * eye)
+    left = same + 10 ** (-snr_db / 10) * eye - linear @ next_.mT
+    whiten = torch.linalg.cholesky(matrix_inverse(left)).mT
+    by_pulse = data.movedim(-3, -2)
+    later, earlier = (
+        whiten.to(data.dtype) @ by_pulse[..., 1:, :, :],
+        (whiten @ linear).to(data.dtype) @ by_pulse[..., :-1, :, :],
+    )
+    return later.movedim(-2, -3), earlier.movedim(-2, -3)
+
+
+def _block_sums(x: Tensor, block: Tensor) -> Tensor:
+    """Add values (..., pulse, range) over the pulses of each block, float64 (..., block, range)."""
+    sums = torch.zeros(*x.shape[:-2], int(block[-1]) + 1, x.shape[-1], dtype=torch.float64, device=x.device)
+    return sums.index_add(-2, block.to(x.device), x.to(torch.float64))
+
+
 def remove_synchronisation(
     data: Tensor, radar: BistaticRadar, phase_rad: Tensor, delay_s: Tensor | None = None, with_range: bool = True
 ) -> Tensor:
@@ -174,6 +293,49 @@ class EstimateSynchronisation(ChannelStage):
                 f"shape {tuple(direct_path.shape)}"
             )
         return estimate_synchronisation(direct_path, self.radar, assess=self.assess)
+
+
+class ClutterSynchronisation(Stage):
+    """Stage that estimates the clock phase of each pulse from the echo of what is at rest.
+
+    >>> from torchsar import Draws, echo, multichannel, radar, scene
+    >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)
+    >>> world = scene.BistaticWorld(None, scene.BandLimited(1.0), scene.KSea(), snr_db=40.0)
+    >>> drift = {"clock": echo.SynchronisationError(phase_rad=[0.0, 0.0, 20.0])}
+    >>> sea, truth = echo.simulate_bistatic(receiver, world, 90, 64, Draws(1), impairments=drift)
+    >>> found = multichannel.ClutterSynchronisation(receiver, 90.0)(sea.signal)["phase_rad"]
+    >>> true = truth.values["clock.phase_rad"]
+    >>> bool((found - true).std() < 0.1 * true.std())
+    True
+
+    See `estimate_clutter_synchronisation`. It follows the balance of the channels, and the stage
+    that uses it is connected as `use(RemoveSynchronisation(radar), phase_rad="clock")`.
+
+    Args:
+        radar: Radar parameters.
+        band_hz: Doppler bandwidth in Hz of what is at rest, about zero.
+        block_s: Length in seconds of the blocks in which range cells are compared.
+        snr_db: Power of what is at rest over the noise in dB, for the prediction.
+        assess: Whether quality and outcome are assessed.
+    """
+
+    works_on = ("channel", "pulse", "range")
+    provides = ("phase_rad",)
+    neutral = {"phase_rad": 0.0}
+
+    def __init__(
+        self, radar: BistaticRadar, band_hz: float, block_s: float = 0.25, snr_db: float = 30.0, *, assess: bool = True
+    ) -> None:
+        super().__init__()
+        self.radar, self.settings, self.assess = radar, (band_hz, block_s, snr_db), assess
+
+    def forward(self, signal: Signal) -> Estimate:
+        """Estimate the clock phase of each pulse of channels with the axes (channel, pulse, range).
+
+        Returns:
+            `phase_rad` of shape (..., pulse), see `estimate_clutter_synchronisation`.
+        """
+        return estimate_clutter_synchronisation(signal.data, self.radar, *self.settings, assess=self.assess)
 
 
 class RemoveSynchronisation(ChannelStage):

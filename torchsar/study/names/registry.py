@@ -502,7 +502,7 @@ WORLD = {
     "IMPAIRMENTS (isal, isal_rotation)": TARGET_IMPAIRMENTS,
     "IMPAIRMENTS (path)": PATH_IMPAIRMENTS,
     "IMPAIRMENTS (sal)": LADAR_IMPAIRMENTS,
-    "IMPAIRMENTS (geo)": MULTICHANNEL_IMPAIRMENTS,
+    "IMPAIRMENTS (geo, geo_ocean)": MULTICHANNEL_IMPAIRMENTS,
 }
 
 # the bases of other stages, and what gives no signal

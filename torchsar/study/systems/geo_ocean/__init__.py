@@ -13,8 +13,8 @@ from typing import Annotated, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchsar.core import Chain, Draws, Outcome, Signal, Trace
-from torchsar.echo import bistatic_echo, simulate_bistatic
+from torchsar.core import Draws, Outcome, Signal, Trace
+from torchsar.echo import Impairment, apply_impairments, bistatic_echo, simulate_bistatic
 from torchsar.multichannel import Extraction, PointMotion, RemoveTransmitRange, StationaryImage
 from torchsar.multichannel.reconstruct import LeastSquares, Rebuild, condition_number, noise_gain_db
 from torchsar.multichannel.scene_image import MoversImage
@@ -24,7 +24,7 @@ from torchsar.scene import Ship as ShipOfPoints
 from torchsar.scene.bistatic import Gate
 from torchsar.scene.movers import Movers
 from torchsar.scene.sea import Sea
-from torchsar.study.names.registry import GATES, SEAS
+from torchsar.study.names.registry import GATES, MULTICHANNEL_IMPAIRMENTS, SEAS
 from torchsar.study.output.report import Drawn, comparisons
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.systems.geo.figures import by_target
@@ -35,11 +35,12 @@ from torchsar.study.systems.geo_ocean.judge import (
     MadeScene,
     Ship,
     ShownShip,
+    at_rest,
     made_scenes,
     matched,
     ship_metrics,
 )
-from torchsar.study.trials.batch import OK, Found, Judged, Processed, Result, Trials, verdict
+from torchsar.study.trials.batch import OK, Found, Judged, Processed, Result, Trials, image_of, verdict
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.system import Column, System, World
 
@@ -114,6 +115,7 @@ class Ocean(World):
         targets: Ships by name.
         gate: Illumination of ships and sea over slow time.
         sea: Clutter of the sea; its cnr_db is its power over the noise in dB.
+        impairments: Impairments of the recording by name, applied in this order.
     """
 
     pulses: int
@@ -121,6 +123,7 @@ class Ocean(World):
     targets: Mapping[str, Vessel]
     gate: Annotated[Gate, GATES] = field(default_factory=lambda: BandLimited(4.5))
     sea: Annotated[Sea, SEAS] = field(default_factory=lambda: KSea(power_db=30.0))
+    impairments: Mapping[str, Annotated[Impairment, MULTICHANNEL_IMPAIRMENTS]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -179,7 +182,8 @@ class Ocean(World):
             )
             for i in range(count)
         ]
-        return Trials(recording, recording, _truth(ships, frames), count, frames)
+        impaired, known = apply_impairments(recording, self.impairments, scenes)
+        return Trials(impaired, recording, {**_truth(ships, frames), **known}, count, frames)
 
 
 def _ship(radar: BistaticRadar, motion: PointMotion, movers: Movers, echo: Signal, i: int) -> Ship:
@@ -223,10 +227,14 @@ class Judging:
 
 
 class View(NamedTuple):
-    """What pictures need of a method: images of every trial, and detected targets by ship."""
+    """What pictures need of a method: images of every trial, detected targets by ship, and the
+    channels of the first trial after each stage that changes them, once the transmit range is
+    removed.
+    """
 
     made: Sequence[MadeScene]
     found: Sequence[Mapping[str, FoundTarget | None]]
+    steps: Mapping[str, Signal]
 
 
 class GeoOcean(System):
@@ -237,6 +245,7 @@ class GeoOcean(System):
     Radar = staticmethod(bistatic_radar)
     World = Ocean
     Judging = Judging
+    impairments = MULTICHANNEL_IMPAIRMENTS
     ending = "movers_image or stationary_image"
     truths = TRUTHS
     draw_case = figures.DRAW_CASE
@@ -306,7 +315,7 @@ class GeoOcean(System):
         "false_targets": Column("detected targets that belong to no ship"),
         "condition_number": Column("condition number of the reconstruction of what is at rest"),
         "noise_gain_db": Column("noise gain of the reconstruction of what is at rest", "dB"),
-        "ok": Column("share of trials in which every ship is found and reliable"),
+        "ok": Column("share of trials in which every ship is found and reliable, and every other estimate too"),
         "seconds": Column("time of a trial", "s"),
     }
 
@@ -315,18 +324,12 @@ class GeoOcean(System):
 
     def check(self, bench: Bench) -> None:
         for name, chain in bench.chains.items():
-            *before, last = chain.stages
+            last = list(chain.stages)[-1]
             if not isinstance(chain.stages[last], (StationaryImage, MoversImage)):
                 raise ConfigError(
                     f"{bench.file}: processor.{name}: system geo_ocean makes images of scenes; end the chain with "
                     f"{self.ending}, not with {last!r}"
                 )
-            for stage in before:
-                if chain.uses[stage] or getattr(chain.stages[stage], "provides", ()):
-                    raise ConfigError(
-                        f"{bench.file}: processor.{name}.stages.{stage}: stages before {last!r} may neither "
-                        "estimate nor use values; leave this stage out"
-                    )
 
     def may_differ(self, path: str, world: Mapping[str, Any]) -> bool:
         """Return whether a number of the world, by dotted key, may differ between trials.
@@ -340,6 +343,7 @@ class GeoOcean(System):
 
     def judge(self, bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -> Judged:
         made, stage = made_scenes(trace, bench.radar.speed_m_s), at_rest(bench.chains[name])
+        *before, last = bench.chains[name].stages
         rows, views, reach = [], [], (float(bench.judging.match_m[0]), float(bench.judging.match_m[1]))
         for scene, frame in zip(made, trials.own, strict=True):
             still = frame.still_image(stage)
@@ -354,11 +358,14 @@ class GeoOcean(System):
             counts = [len(s.targets or ()) - sum(t is not None for t in f.values()) for s, f in zip(made, views)]
             whole["false_targets"] = torch.tensor(counts, dtype=torch.float64)
             found = torch.stack([of[OK] > 0 for of in ships.values()]).all(0)
-            whole |= verdict({"ships": Outcome.of(found, Outcome.NOISE)})
+            others = {n: e.outcome.expand(trials.count) for n, e in trace.estimates.items() if n != last}
+            whole |= verdict({"ships": Outcome.of(found, Outcome.NOISE), **others})
         if not detail:
             whole |= {f"{ship}.{key}": x for ship, of in ships.items() for key, x in of.items() if key != OK}
         whole = {key: value.expand(trials.count) for key, value in whole.items()}
-        return Judged(whole, ships, view=View(made, views))
+        changed = [n for n in before if trace.outputs[n] is not trace.inputs[n]] if detail else []
+        steps = {n: image_of(trace.outputs[n]) for n in changed}
+        return Judged(whole, ships, view=View(made, views, steps))
 
     def found(self, bench: Bench, outcome: Processed, trials: Trials) -> dict[str, Found]:
         """Return the estimated motion of every ship; NaN in trials in which it was not found."""
@@ -397,12 +404,6 @@ class GeoOcean(System):
             "Errors of positions are relative to the position in the image of the ship's own echo. The scatterers of a "
             "ship interfere, so that no image shows the centroid of their powers.",
         )
-
-
-def at_rest(chain: Chain) -> StationaryImage:
-    """The stage of a chain that images what is at rest."""
-    last: Any = list(chain.stages.values())[-1]
-    return last.flow.image if isinstance(last, MoversImage) else last
 
 
 def _extraction(bench: Bench) -> Extraction:

@@ -162,7 +162,8 @@ def _flows(bench: Bench) -> Measured:
         )
     radar = replace(bench.radar, reference_range_m=bench.radar.reference_range_m + float(ship.range_m))
     pulses, samples = min(_CROP[0], world.pulses), min(_CROP[1], world.samples)
-    crop = replace(world, pulses=pulses, samples=samples, targets={name: replace(ship, range_m=0.0)})
+    alone = {name: replace(ship, range_m=0.0)}
+    crop = replace(world, pulses=pulses, samples=samples, targets=alone, impairments={})
     trials = crop.trials_of(radar, bench.draws("trade", [0]), flow.extraction, bench.dtype, bench.device)
     (frame,), clean = trials.own, RemoveTransmitRange(radar)(trials.recording.signal)
     kept: Mapping[str, Any] = {

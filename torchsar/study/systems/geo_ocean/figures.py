@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,10 @@ import torch
 
 from torchsar import plot
 from torchsar.core import Signal
+from torchsar.multichannel import RemoveTransmitRange, StationaryImage
+from torchsar.multichannel.reconstruct import LeastSquares
 from torchsar.study.output.report import Drawn
-from torchsar.study.systems.geo_ocean.judge import ImagePosition, MadeScene, ShownShip
+from torchsar.study.systems.geo_ocean.judge import ImagePosition, MadeScene, ShownShip, at_rest
 from torchsar.study.trials.batch import Result
 
 # highest and lowest level of drawn scenes over the sea (dB)
@@ -57,18 +60,40 @@ def _marked(result: Result, title: str, image: Signal, apparent: bool) -> dict[s
     return {"title": title, "signal": _over_sea(image), "lines": lines}
 
 
+def _steps(result: Result) -> dict[str, Signal]:
+    """Images of what each step of the recommended method before the detection of ships leaves.
+
+    A step is a stage that changes the channels, from the removal of the transmit range on, without
+    which nothing is focused. The last image is that of all channels. Before it is the one of a
+    single channel, whose Doppler bands overlap.
+    """
+    chain, view = result.bench.chains["recommended"], result.first.outcomes["recommended"].judged.view
+    stage, names = at_rest(chain), list(view.steps)
+    first = next((i for i, name in enumerate(names) if isinstance(chain.stages[name], RemoveTransmitRange)), 0)
+    images = {f"after {name}": stage(view.steps[name]) for name in names[first:-1]}
+    middle = len(stage.radar.channel_m) // 2
+    alone = StationaryImage(replace(stage.radar, channel_m=(0.0,)), LeastSquares(1), stage.form)
+    images["one channel"] = alone(view.steps[names[-1]].isel(channel=slice(middle, middle + 1)))
+    return images
+
+
 def _flow(result: Result) -> Drawn:
     made = _made(result).get("recommended")
-    if made is not None:
-        steps = {"everything at rest": made.conventional, "without moving ships": made.rest, "fused": made.fused}
-        parts = [_marked(result, title, image, title != "fused") for title, image in steps.items()]
-        caption = (
-            "Root mean square of blocks; the scale ends 10 dB below the sea. First: everything is focused "
-            "as if at rest; ships with a radial velocity are displaced and have false targets. Second: the echoes of "
-            "moving ships are subtracted. Third: every moving ship is focused and inserted at its position."
-        )
-        figures = plot.overlays(parts, _UP_DB - _DOWN_DB)
-        yield "flow", "Steps of the recommended method", caption, figures
+    if made is None:
+        return
+    steps = {**_steps(result), "everything at rest": made.conventional, "without moving ships": made.rest}
+    parts = [_marked(result, title, image, True) for title, image in steps.items()]
+    parts.append(_marked(result, "fused", made.fused, False))
+    if made.targets is not None:
+        found = {"found": _boxes([ImagePosition.of(target.motion) for target in made.targets if target.ok])}
+        parts.insert(-2, {"title": "detected", "signal": _over_sea(made.conventional), "lines": found})
+    caption = (
+        "Root mean square of blocks; the scale ends 10 dB below the sea. What each stage leaves, focused as if "
+        "everything were at rest: a single channel, whose Doppler bands overlap, and all channels, from which the "
+        "bands are reconstructed. Ships with a radial velocity are displaced there and have false targets. Then the "
+        "echoes of detected ships that move are subtracted, and every one is focused and inserted at its position."
+    )
+    yield "flow", "Steps of the recommended method", caption, plot.overlays(parts, _UP_DB - _DOWN_DB)
 
 
 def _methods(result: Result) -> Drawn:

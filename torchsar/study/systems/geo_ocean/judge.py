@@ -5,14 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 
-from torchsar.core import Signal, Trace
+from torchsar.core import Chain, Signal, Trace
 from torchsar.multichannel.body import centred_motion
 from torchsar.multichannel.chip import Extraction, chip_about
 from torchsar.multichannel.migration import Frame
 from torchsar.multichannel.motion import PointMotion
+from torchsar.multichannel.scene_image import MoversImage
 from torchsar.multichannel.stationary import StationaryImage
 from torchsar.radar import BistaticRadar
 
@@ -225,6 +227,12 @@ class MadeScene:
     targets: Sequence[FoundTarget] | None = None
 
 
+def at_rest(chain: Chain) -> StationaryImage:
+    """The stage of a chain that images what is at rest."""
+    last: Any = list(chain.stages.values())[-1]
+    return last.flow.image if isinstance(last, MoversImage) else last
+
+
 def made_scenes(trace: Trace, speed_m_s: float) -> list[MadeScene]:
     """Collect the images and detected targets of every trial from the run of a processing chain.
 
@@ -237,10 +245,10 @@ def made_scenes(trace: Trace, speed_m_s: float) -> list[MadeScene]:
         One scene for each trial.
     """
     data, axes = trace.signal.data.reshape(-1, *trace.signal.data.shape[-2:]), trace.signal.axes
-    if not trace.estimates:
+    estimate = trace.estimates.get(list(trace.outputs)[-1])
+    if estimate is None:
         images = [Signal(image, axes) for image in data]
         return [MadeScene(image, image, image) for image in images]
-    (estimate,) = trace.estimates.values()
     info = {name: x.reshape(len(data), *x.shape[len(trace.signal.trials) :]) for name, x in estimate.info.items()}
     values = [estimate.value[key].reshape(len(data), -1) for key in ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")]
     std, ok = estimate.std["u_r_m_s"].reshape(len(data), -1), estimate.ok.reshape(len(data), -1)
