@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -59,20 +60,26 @@ def test_yaml_reads_numbers_as_numbers(text: str, value: object) -> None:
     assert type(parse(text, "text")) is type(value)
 
 
+LARGE = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
+    f"{new}: &{new} [{', '.join([f'*{old}'] * 10)}]\n" for old, new in pairwise("abcdefgh")
+)
+
+
 @pytest.mark.parametrize(
     "text, said",
     [
         ("[" * 600 + "]" * 600, "line 1: .*more than 50 parts inside each other"),
         ("\n".join("  " * i + "a:" for i in range(600)), "line 50: .*more than 50 parts"),
-        ("a: &a [*a]", "not readable as YAML"),
-        ("a: &a {b: *a}", "not readable as YAML"),
+        (LARGE, "more than 200000 values with all repetitions"),
+        ("a: &a [*a]", "more than 200000 values with all repetitions"),
+        ("a: &a {b: *a}", "more than 200000 values with all repetitions"),
         ('a: "\\ud800"', "not readable as YAML"),
         ("? [1, 2]\n: 3", "a key must be a word"),
         ("'': 3", "a key must be a word"),
         ("a: " + "9" * 5000, "not readable as YAML"),
         ("a: !!python/object:os.system {}", "not readable as YAML"),
     ],
-    ids=range(9),
+    ids=range(10),
 )
 def test_documents_that_no_step_could_use_are_refused(text: str, said: str) -> None:
     with pytest.raises(ConfigError, match=said) as error:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -24,22 +24,31 @@ _RULES = {
     "bool": (r"true|True|TRUE|false|False|FALSE", "tTfF"),
     "null": (r"~|null|Null|NULL|", ["~", "n", "N", ""]),
 }
-_DEEPEST = 50  # sections and lists inside each other: far more than configs have
+# sections and lists inside each other, and values of a document with all its repetitions: far more
+# than configs have, and few enough for any later step
+_DEEPEST, _MOST_VALUES = 50, 200_000
 
 
 class _Loader(yaml.SafeLoader):
-    """Loader of safe YAML 1.2. It rejects duplicate keys, and documents that are too deep."""
+    """Loader of safe YAML 1.2. It rejects duplicate keys, and documents that are too large."""
 
     yaml_implicit_resolvers: dict[Any, Any] = {}
     depth = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        self.depth += 1
+        mark, self.depth = self.peek_event().start_mark, self.depth + 1
         if self.depth > _DEEPEST:
-            mark = self.peek_event().start_mark
             raise ComposerError(None, None, f"more than {_DEEPEST} parts inside each other", mark)
-        node = super().compose_node(parent, index)
+        again = self.check_event(yaml.AliasEvent)
+        node: Any = super().compose_node(parent, index)
         self.depth -= 1
+        parts: Any = node.value
+        if isinstance(parts, str):
+            parts = parts.encode()[:0]  # a ValueError for half of a pair of surrogates
+        if not again:
+            node.size = 1 + sum(one.size for part in parts for one in (part if isinstance(part, tuple) else [part]))
+        if getattr(node, "size", math.inf) > _MOST_VALUES:  # infinite inside itself
+            raise ComposerError(None, None, f"more than {_MOST_VALUES} values with all repetitions", mark)
         return node
 
 
@@ -90,15 +99,13 @@ def parse(text: str, what: str) -> Any:
         ConfigError: If it is no YAML; the message has the source and the line.
     """
     try:
-        tree = yaml.load(text, Loader=_Loader)  # a SafeLoader
-        json.dumps(tree, ensure_ascii=False).encode()  # a ValueError for what contains itself, or is no text
+        return yaml.load(text, Loader=_Loader)  # a SafeLoader
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         line = f", line {mark.line + 1}" if mark else ""
         raise ConfigError(f"{what}{line}: not readable as YAML: {error.problem}") from None
     except (yaml.YAMLError, ValueError) as error:
         raise ConfigError(f"{what}: not readable as YAML: {one_line(error)}") from None
-    return tree
 
 
 def dump(tree: Mapping[str, Any]) -> str:
