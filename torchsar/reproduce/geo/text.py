@@ -100,6 +100,7 @@ def _equation_13() -> Check:
     return misprint("second term of the range error, Eq. (13)", "1.6e-3 m", second < 0.5e-3, ours)
 
 
+# items in the order of the paper
 ITEMS = (
     given(
         "Text 1",

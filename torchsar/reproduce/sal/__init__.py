@@ -16,6 +16,7 @@ def _micrometre() -> Check:
     return statement("motion of a micrometre", "spoils the focus", phase > math.pi / 4, f"{phase:.1f} rad")
 
 
+# the paper with its items
 PAPER = Paper(
     "sal",
     "SAL motion compensation by segmented interference of triangular sweeps, Remote Sens. 2024, 16, 793",
