@@ -64,7 +64,7 @@ MISTAKES = [
     ("sal", {"metrics": {"reference": ["sca"]}}, "metrics.reference names ['sca'], which is no method"),
     ("stripmap", {"world": world("stripmap", squint_deg=1.0)}, "both give the direction of the beam"),
     ("stripmap", {"world": world("stripmap", doppler_hz=None, squint_deg=90.0)}, "between -90 and 90 degrees"),
-    ("stripmap", {"world": world("stripmap", lines=1)}, "at least one scene, 2 lines and 2 samples"),
+    ("stripmap", {"world": world("stripmap", lines=1)}, "world needs at least 2 lines, got 1"),
     ("stripmap", alone({"stage": "omega_k", "doppler_hz": [1.0, 2.0]}), "doppler_hz' has the value [1.0, 2.0]"),
     ("stripmap", alone({"stage": "compress_dechirped"}), "needs radar.pulse_s"),
     # isal

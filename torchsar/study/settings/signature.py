@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import logging
 import re
 import types
 import typing
@@ -15,10 +16,13 @@ from functools import cached_property
 from typing import Any
 
 import torch
+import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 from torch import Tensor
 
 from torchsar.study.settings.errors import ConfigError, did_you_mean, one_line
+
+log = logging.getLogger("torchsar")
 
 _SCALARS = (float, int, str, bool, type(None))
 _YAML = (*_SCALARS, tuple, list)
@@ -109,6 +113,7 @@ class Section:
             ConfigError: If the content is not valid. The message gives file, key, value and the
                 accepted values.
         """
+        tree = self._with_new_names(tree, where, file)
         open_keys = [key for key in self.automatic if isinstance(tree, dict) and tree.get(key) == AUTO]
         fixed = {key: value for key, value in tree.items() if key not in open_keys} if open_keys else tree
         try:
@@ -124,6 +129,18 @@ class Section:
             else:
                 values[name] = key.inner.check(value, path, file)
         return values
+
+    def _with_new_names(self, tree: Any, where: str, file: str) -> Any:
+        """The section with keys that were renamed under their new names."""
+        known = self.model.model_fields
+        for key in [key for key in tree if key not in known] if isinstance(tree, dict) else []:
+            first, _, inner = RENAMED.get(str(key), "").partition(".")
+            held = tree.get(first, {} if inner else None)
+            if first in known and (isinstance(held, dict) and inner not in held if inner else first not in tree):
+                log.warning("%s: key '%s' is now called '%s'", file, f"{where}.{key}", RENAMED[key])
+                value = {**held, inner: tree[key]} if inner else tree[key]
+                tree = {**{k: v for k, v in tree.items() if k != key}, first: value}
+        return tree
 
     def make(self, values: Mapping[str, Any], where: str, file: str, given: Given = _NOTHING, **context: Any) -> Any:
         """Build the object of a section.
@@ -227,10 +244,12 @@ class Catalogue:
         name, rest = entry[self.key], {key: value for key, value in entry.items() if key != self.key}
         if name == AUTO:
             return entry
+        new, _, more = RENAMED.get(str(name), "").partition(", ")
+        if name not in self.entries and new in self.entries:
+            text = "%s: %s: '%s: %s' is now called '%s: %s'"
+            log.warning(text, file, where, self.key, name, self.key, RENAMED[name])
+            name, rest = new, {**yaml.safe_load(f"{{{more}}}"), **rest}
         if not isinstance(name, str) or name not in self.entries:
-            new = RENAMED.get(str(name), "")
-            if new.split(",")[0] in self.entries:
-                raise ConfigError(f"{file}: {where}: '{self.key}: {name}' is now called '{self.key}: {new}'; rename it")
             hint = did_you_mean(str(name), self.entries, "`torchsar list` shows all" if self.what == "stage" else "")
             raise ConfigError(f"{file}: {where}.{self.key} names an unknown {self.what} {name!r}{hint}")
         return {self.key: name, **self.sections[name].check(rest, where, file)}
@@ -359,7 +378,7 @@ def snake(name: str) -> str:
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", name).lower()
 
 
-# keys, values, stages and kinds that were renamed; the message about an old one gives the new one
+# keys, values, stages and kinds that were renamed; old ones are accepted with a sentence
 RENAMED = {
     "damages": "impairments",
     "told": "trigger_known",
@@ -405,6 +424,7 @@ RENAMED = {
     "u_a_reach_m_s": "search.u_a_m_s",
     "y0_reach_m": "search.y0_m",
     "straight": "straight_path",
+    "recorded": "recorded_path",
     "circular": "circular_path",
     "plane": "plane_ground",
     "normal": "start_phase",
