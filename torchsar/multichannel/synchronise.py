@@ -132,8 +132,8 @@ def estimate_clutter_synchronisation(
 
     Returns:
         `phase_rad` (..., pulse), whose line of least squares is zero, with one standard deviation
-        for all pulses, by the scatter between four parts of the range cells. Outcomes: `INEXACT`
-        where it exceeds 0.3 rad, `NOISE` where it exceeds 1 rad.
+        for all pulses, by what changes without each of four parts of the range cells. Outcomes:
+        `INEXACT` where it exceeds 0.3 rad, `NOISE` where it exceeds 1 rad.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -172,8 +172,10 @@ def estimate_clutter_synchronisation(
         parts, cell = 4, torch.arange(data.shape[-1], device=data.device)
         sums = torch.zeros(*turn.shape, parts, dtype=product.dtype, device=data.device)
         sums = sums.index_add(-1, cell // 8 % parts, (weight[..., block, :] * product).to(sums)).movedim(-1, -2)
-        off = _phase_without_line(torch.sgn(sums)) - phase[..., None, :]
-        std = (off.square().sum(-2).mean(-1) / (parts * (parts - 1))).sqrt()
+        # jackknife: what changes without a part, so that one that dominates counts fully
+        left = sums.sum(-2, keepdim=True) - sums
+        off = _phase_without_line(torch.sgn(left)) - phase[..., None, :]
+        std = (off.square().sum(-2).mean(-1) * ((parts - 1) / parts)).sqrt()
         std = torch.where((sums == 0).any(-1).any(-1), torch.inf, std).clamp_max(1e3)
     outcome = worst((Outcome.INEXACT, ~(std <= 0.3)), (Outcome.NOISE, ~(std <= 1.0)))
     spread = std[..., None].expand_as(phase)
