@@ -86,6 +86,7 @@ from torchsar.scene import (
     QuadraticInSweep,
     RandomPoints,
     RandomWalk,
+    RecordedPath,
     RetroAndBrokenLine,
     Satellite,
     Scatterers,
@@ -727,6 +728,7 @@ FACTORIES = (
 # parameters annotated with Tensor that have no case, and plain numbers, each with the reason
 NOT_PER_TRIAL = {
     (MeasuredTrack, "time_s"): "times of measurement, which all trials share",
+    (RecordedPath, "start_s"): "time of the log at the first pulse, which all trials share",
     (Navigation, "rate_hz"): "decides how many records there are",
     (PathWorld, "window_range_m"): "a setting of the receiver, which all trials share",
     (Aircraft, "spacing_m"): "decides how many scatterers there are",

@@ -28,7 +28,11 @@ PLACES: dict[tuple[str, str], tuple[str, str, list[str]]] = {
     ("stripmap", "world.path"): ("stripmap_damaged", "world.path.kind", []),
     ("isal", "world.fidelity"): ("isal_table1", "world.fidelity.kind", []),
     ("isal_rotation", "world.fidelity"): ("isal_corner_cubes", "world.fidelity.kind", ["radar.pulse_s=1e-6"]),
-    ("isal_rotation", "rotation.order"): ("isal_rotation_points", "processor.recommended.stages.rotation.order", []),
+    ("isal_rotation", "uneven_rotation.order"): (
+        "isal_rotation_points",
+        "processor.recommended.stages.rotation.order",
+        [],
+    ),
     ("isal_rotation", "matched_fourier.transform"): (
         "isal_rotation_points",
         "processor.recommended.stages.image.transform",
@@ -36,12 +40,16 @@ PLACES: dict[tuple[str, str], tuple[str, str, list[str]]] = {
     ),
     ("sal", "world.fidelity"): ("sal_points", "world.fidelity.kind", ["world.periods=64"]),
     ("geo", "world.receive"): ("geo_point_targets", "world.receive.kind", ["world.samples=null"]),
-    ("geo", "transmit_range_remove.order"): (
+    ("geo", "remove_transmit_range.order"): (
         "geo_pattern",
         "processor.recommended.stages.transmit.order",
         ["world.pulses=900"],
     ),
-    ("geo", "migration_correct.kind"): ("geo_point_targets", "processor.recommended.stages.migration.kind", []),
+    ("geo", "correct_migration.migration"): (
+        "geo_point_targets",
+        "processor.recommended.stages.migration.migration",
+        [],
+    ),
     ("path", "stage"): ("airborne_spotlight", "processor.recommended.stages.image.stage", []),
     ("geo_ocean", "stationary_image.form"): ("geo_ocean", "processor.conventional.stages.image.form", []),
 }

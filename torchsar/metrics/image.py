@@ -215,7 +215,7 @@ def _norm(x: Tensor) -> Tensor:
     """
     level = level_of(x)
     energy = power_of(x / level).sum((-2, -1), dtype=torch.float64)
-    return torch.where(energy > 0, torch.where(energy > 0, energy, 1.0).sqrt(), 0.0) * level[..., 0, 0]
+    return torch.where(energy == 0, 0.0, torch.where(energy == 0, 1.0, energy).sqrt()) * level[..., 0, 0]
 
 
 def correlation(image: Tensor | Signal, reference: Tensor | Signal) -> Tensor:
