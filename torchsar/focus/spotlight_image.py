@@ -83,7 +83,7 @@ def scene_grid(
     centre = antennas.transmitter_m.new_zeros(3) if corners_m is None else corners_m.mean(0)
     extent = (window_m, window_m)
     if near:
-        centre, extent = _abeam(antennas, window_m, told=centre_m is None)
+        centre, extent = _abeam(antennas, window_m, warn=centre_m is None)
     if centre_m is not None:
         centre = torch.cat([centre.new_tensor(list(centre_m)), centre[2:]])
     away = [centre - place for place in antennas.places]
@@ -148,9 +148,9 @@ def _closed(antennas: AntennaPath) -> bool:
     return float((place[-1] - place[0]).norm()) < float(place.diff(dim=0).norm(dim=-1).sum()) / (2 * math.pi)
 
 
-def _abeam(antennas: AntennaPath, window_m: float, told: bool) -> tuple[Tensor, tuple[float, float]]:
+def _abeam(antennas: AntennaPath, window_m: float, warn: bool) -> tuple[Tensor, tuple[float, float]]:
     """The middle of the scene of a radar that does not point at the origin, and its extents in
-    range and azimuth in metres. A warning says which side was chosen, if `told`.
+    range and azimuth in metres. A warning says which side was chosen, if `warn`.
     """
     place = torch.stack(antennas.places).mean(0)
     middle = (place.amax(0) + place.amin(0)) / 2
@@ -168,7 +168,7 @@ def _abeam(antennas: AntennaPath, window_m: float, told: bool) -> tuple[Tensor, 
     reference_m, height_m = float(antennas.reference_m.median()) / 2, float(place[:, 2].mean())
     first = max(reference_m - window_m / 2, 0.0)
     low, high = (math.sqrt(max(r**2 - height_m**2, 0.0)) for r in (first, first + window_m))
-    if told:
+    if warn:
         warnings.warn(
             f"the phase history does not point at the origin: the image shows ground ranges from {low:.3g} to "
             f"{high:.3g} m from the path, in the direction ({float(side[0]):.2f}, {float(side[1]):.2f}) of (x, y), "

@@ -117,7 +117,7 @@ class SeenAperture:
         return self.aperture.weight(radar, motion, time_s) * self.profile[(..., *[None] * more, slice(None))]
 
 
-# what stages take, and what they expect unless told otherwise
+# what stages take, and what they expect by default
 Expected = Dwell | ElementBeam
 ELEMENT_BEAM = ElementBeam()
 # Expected amplitude of the echo of a point, centred on the time at which it is at broadside.
