@@ -15,9 +15,11 @@ from typing import Any
 
 import pytest
 
+from torchsar import Outcome
 from torchsar.cli import parser
 from torchsar.reproduce import paper
 from torchsar.study.commands.sweep import SweepTrial, sweep_grid
+from torchsar.study.names.registry import stages
 from torchsar.study.table import load
 from torchsar.study.trials.bench import Bench
 
@@ -149,6 +151,16 @@ def test_other_blocks_are_well_formed() -> None:
             assert tomllib.loads(block)
         languages = set(re.findall(r"^```([a-z]+)", page.read_text(encoding="utf-8"), re.MULTILINE))
         assert languages <= {"python", "bash", "yaml", "json", "toml", "text"}, name(page)
+
+
+@pytest.mark.parametrize("section, columns", [("By modality", (1, 2)), ("By scene", (1,))])
+def test_the_table_of_estimators_names_stages_and_outcomes(section: str, columns: tuple[int, ...]) -> None:
+    text = (DOCS / "how_to" / "estimators.md").read_text(encoding="utf-8")
+    part = text.partition(f"## {section}\n")[2].partition("\n## ")[0]
+    rows = [line.strip("|").split("|") for line in part.splitlines() if line.startswith("| ") and "---" not in line]
+    named = {name for row in rows for column in columns for name in re.findall(r"`([a-z_]+)`", row[column])}
+    assert len(named) > 3 and not named - set(stages().entries) - {"scene"}
+    assert set(re.findall(r"`([A-Z_]{4,})`", text)) <= {outcome.name for outcome in Outcome}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
