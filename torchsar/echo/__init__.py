@@ -13,6 +13,10 @@ impairments of any recording      `apply_impairments`, each an `Impairment`
 lost or misnumbered lines         `LostLines`, `LostGaps`, `LostPulses`, `RepeatedLines`,
                                   `CorruptedNumbers`
 interference, converter           `Tone`, `WideInterferer`, `Quantiser`, `PeriodicJitter`
+pulses of another radar           `PulsedInterference`
+constant, drift, spur             `Leakage`
+I and Q, gain, range gate         `QuadratureError`, `GainSteps`, `GateJumps`
+echo that does not move along     `GroundAtRest`
 receiver of one channel           `ChannelResponse`, made by `smooth_response`
 receiver of several channels      `ChannelImbalance` for lines in turn, `ChannelErrors` for channels
                                   along track
@@ -39,6 +43,7 @@ from torchsar.echo.ladar_record import simulate_ladar_record
 from torchsar.echo.lines import CorruptedNumbers, LostGaps, LostLines, LostPulses, RepeatedLines
 from torchsar.echo.path import PathError, path_echo, simulate_path
 from torchsar.echo.pulse_phase import PhaseSinusoid, PhaseWalk, WhitePhase
+from torchsar.echo.receiver import GainSteps, GateJumps, GroundAtRest, Leakage, PulsedInterference, QuadratureError
 from torchsar.echo.recorded import Impairment, apply_impairments
 from torchsar.echo.response import ChannelResponse, smooth_response
 from torchsar.echo.strip import simulate, stripmap_echo
@@ -50,7 +55,11 @@ __all__ = [
     "ChannelImbalance",
     "ChannelResponse",
     "CorruptedNumbers",
+    "GainSteps",
+    "GateJumps",
+    "GroundAtRest",
     "Impairment",
+    "Leakage",
     "LostGaps",
     "LostLines",
     "LostPulses",
@@ -59,6 +68,8 @@ __all__ = [
     "PhaseSinusoid",
     "PhaseWalk",
     "PolynomialSweepError",
+    "PulsedInterference",
+    "QuadratureError",
     "Quantiser",
     "RepeatedLines",
     "SinusoidSweepError",

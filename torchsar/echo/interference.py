@@ -156,7 +156,7 @@ class WideInterferer:
 
 
 @dataclass(frozen=True)
-@finite_numbers("a converter", rms_levels="positive")
+@finite_numbers("a converter", bits=None, rms_levels="positive")
 class Quantiser:
     """Impairment: an I/Q converter behind an automatic gain control, without dither.
 
@@ -174,7 +174,7 @@ class Quantiser:
     samples at the two outermost levels, shape (...,) each.
 
     Args:
-        bits: Number of bits, 1 to 16, fixed for all trials.
+        bits: Number of bits, a whole number of 1 to 16.
         rms_levels: Rms value of one component, I or Q, at the converter, in units of half the
             distance of neighbouring levels; RADARSAT-1 records 4 bits at 6.6 to 7.4.
 
@@ -182,12 +182,12 @@ class Quantiser:
         ValueError: If the number of bits or the rms value is out of range.
     """
 
-    bits: int
+    bits: Tensor | float
     rms_levels: Tensor | float = 7.0
 
     def __post_init__(self) -> None:
-        if not 1 <= self.bits <= 16:
-            raise ValueError(f"a converter needs 1 to 16 bits, got bits={self.bits}")
+        sentence = "a converter needs a whole number of 1 to 16 bits"
+        refuse_unless(sentence, self.bits, lambda x: (x >= 1) & (x <= 16) & (x % 1 == 0))
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
         refuse_other_trials(self, draws, recording)
@@ -199,8 +199,8 @@ class Quantiser:
         gain = (levels.to(rms.dtype) if isinstance(levels, Tensor) else levels) * torch.where(
             rms > 0, rms, 1
         ).reciprocal()
-        top = 2**self.bits - 1
-        levels = (2 * torch.floor(parts * gain[..., None, None, None] / 2) + 1).clamp(-top, top)
+        top = 2 ** per_trial(self.bits, 3, parts).to(parts.dtype) - 1
+        levels = (2 * torch.floor(parts * gain[..., None, None, None] / 2) + 1).minimum(top).maximum(-top)
         clipped = (levels.abs() == top).to(torch.float64).mean((-3, -2, -1))
         data = torch.view_as_complex((levels / gain[..., None, None, None]).contiguous())
         return with_samples(recording, data), {"gain": gain.to(torch.float64), "extreme_share": clipped}

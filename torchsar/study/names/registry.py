@@ -442,10 +442,22 @@ CALIBRATIONS = Catalogue("calibration", "kind", (scene.CalibrationFibre,))
 GATES = Catalogue("gate", "kind", (scene.BandLimited, scene.Pattern))
 SEAS = Catalogue("sea", "kind", (k_sea, image_sea))
 RECEIVE_RANGES = Catalogue("receive range", "kind", (scene.ExactRange, scene.TaylorRange))
+_OF_RECEIVERS = (echo.Leakage, echo.QuadratureError, echo.GainSteps)
 MULTICHANNEL_IMPAIRMENTS = Catalogue(
-    "impairment of a multichannel recording", "kind", (echo.ChannelErrors, echo.SynchronisationError)
+    "impairment of a multichannel recording",
+    "kind",
+    (echo.ChannelErrors, echo.SynchronisationError, echo.PulsedInterference, *_OF_RECEIVERS),
 )
-_OF_TARGETS = (echo.LostPulses, echo.WhitePhase, echo.PhaseWalk, echo.PhaseSinusoid, echo.Quantiser)
+_OF_TARGETS = (
+    echo.LostPulses,
+    echo.WhitePhase,
+    echo.PhaseWalk,
+    echo.PhaseSinusoid,
+    echo.Quantiser,
+    echo.GateJumps,
+    echo.GroundAtRest,
+    *_OF_RECEIVERS,
+)
 IMPAIRMENTS = Catalogue(
     "impairment",
     "kind",
@@ -454,6 +466,7 @@ IMPAIRMENTS = Catalogue(
         echo.smooth_response,
         echo.Tone,
         echo.WideInterferer,
+        echo.PulsedInterference,
         echo.PeriodicJitter,
         echo.LostLines,
         echo.LostGaps,
@@ -478,7 +491,7 @@ def path_error(x: AntennaMotions = (), y: AntennaMotions = (), z: AntennaMotions
 
 
 PATH_IMPAIRMENTS = Catalogue("impairment of a recording along any path", "kind", (*_OF_TARGETS, path_error))
-LADAR_IMPAIRMENTS = Catalogue("impairment of a ladar recording", "kind", (echo.Quantiser,))
+LADAR_IMPAIRMENTS = Catalogue("impairment of a ladar recording", "kind", (echo.Quantiser, *_OF_RECEIVERS))
 # what `torchsar list` shows besides stages, by the section of the world that names it
 WORLD = {
     "SCENES (world.scene)": SCENES,
