@@ -98,7 +98,7 @@ def _lifted(x: Any) -> Any:
 class _Constants(TorchDispatchMode):
     """Makes tensors of the host, such as tables that a stage keeps, values of a traced program.
 
-    "inductor" takes them in no other form. What is written into such a tensor would be lost.
+    "inductor" takes them in no other form. Writing into such a tensor raises a RuntimeError.
     """
 
     def __torch_dispatch__(

@@ -158,7 +158,10 @@ class LadarCourse:
 
 
 def _later(value: Callable[[Tensor], Tensor], time_s: Tensor, later_s: Tensor | None) -> Tensor:
-    """A function of slow time (n,) at times later by later_s (...,), (..., n)."""
+    """Values (..., n) of a function of slow time at time_s (n,) + later_s (...,).
+
+    If later_s differs between trials, a polynomial through common nodes is evaluated.
+    """
     if later_s is None or later_s.ndim == 0:
         return value(time_s if later_s is None else time_s + later_s)
     # where trials differ: a polynomial through nodes that they share

@@ -121,7 +121,8 @@ def _vectors(
     for side, index in (("Tx", 0), ("Rcv", -1)):
         clock = sent if side == "Tx" else sent + ((legs[0] + legs[-1]) / LIGHT_M_S).numpy()
         earth = frame.geocentric_m(antennas.places[index]).numpy()
-        moved = sent if len(antennas.places) == 1 else clock  # one antenna has one place for both times
+        # a single antenna has the same position at transmission and reception
+        moved = sent if len(antennas.places) == 1 else clock
         speed = np.gradient(earth, moved, axis=0, edge_order=2 if len(moved) > 2 else 1)
         found |= {f"{side}Time": clock, f"{side}Pos": earth, f"{side}Vel": speed}
     return {

@@ -177,7 +177,9 @@ def _stretched(spectrum: Tensor, turns: Tensor, at: Tensor, shift: Tensor, stret
 
 
 def _turned(image: Tensor, phase: Tensor) -> Tensor:
-    """The image with a phase (trial, 5), see `_shifted`."""
+    """Multiply the image by exp(2j pi p), where p is the polynomial with the five coefficients
+    `phase` (trial, 5) in cycles; see `_shifted`.
+    """
     x, y = (_from_middle(n, phase) / n for n in image.shape[-2:])
     along, across = (phase[:, i, None] * at + phase[:, 2 + 2 * i, None] * at.square() for i, at in enumerate((x, y)))
     total = along[..., None] + across[:, None] + phase[:, 3, None, None] * x[:, None] * y
@@ -202,7 +204,9 @@ def _step(moved: Tensor, b: Tensor, seen: Tensor, phase: Tensor, turns: list[Ten
     along = [gain * torch.where(seen, _turned(x, phase), 0) for x in along]
     a, left = gain * a, b - gain * a
     n, m = a.shape[-2:]
-    u, v = _from_middle(n, phase) / n, _from_middle(m, phase) / m  # of the order of 1, for the condition
+    # The coordinates are divided by the size of the image, so that the normal equations are well
+    # conditioned.
+    u, v = _from_middle(n, phase) / n, _from_middle(m, phase) / m
     normal, right = 0.0, 0.0
     for first in range(0, n, _BLOCK_ROWS):
         rows = slice(first, first + _BLOCK_ROWS)

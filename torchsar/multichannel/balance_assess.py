@@ -86,10 +86,12 @@ def assessed_balance(
     # that delays turn over the range band, here their rms, weigh less, since their mean is zero.
     largest, across = torch.maximum(phase_std, log_std).amax(-1), turn_std.amax(-1) / math.sqrt(3)
     relative = torch.maximum(largest / 0.033, across / 0.1)
-    # By choice: the ratio of deviations by the scatter of Doppler bins and of range cells is at
-    # most 1.8 where the prior suits; a point that holds 58 % of the power leaves 3 of 32 parts of
-    # the swath; the logarithm of the likelihood ratio to clutter displaced by whole bands must be
-    # 100, and the standard deviation of a phase .25 rad at most.
+    # Limits by choice.
+    # MISFIT: the ratio of the deviations by the scatter of Doppler bins and of range cells is at
+    # most 1.8 where the prior suits.
+    # AMBIGUOUS: the log likelihood ratio to clutter displaced by whole bands must exceed 100.
+    # TOO_FEW: a point that holds 58 % of the power leaves 3 effective parts of the 32 of the swath.
+    # NOISE: the standard deviation of a phase is at most 0.25 rad.
     outcome = worst(
         (Outcome.INEXACT, ~(relative < 1)),
         (Outcome.MISFIT, misfit.sqrt() >= 2.5),
@@ -135,10 +137,11 @@ def _covariance(score: Tensor, blocks: int = 32) -> Tensor:
 
 
 def _inverse(hessian: Tensor, reference: int, channels: int, least: float = 1e-10) -> tuple[Tensor, Tensor]:
-    """Return the inverse of a Hessian, and whether it is that of a minimum, (...,).
+    """Inverse of a Hessian, and whether it is that of a minimum, (...,).
 
-    Phase and turn of all channels together are not determined: those of the reference are zero. A
-    combination of unknowns with a curvature below `least`, per look, is not determined either.
+    The phase and the phase slope over the band that all channels have in common are not determined,
+    so those of the reference are zero. A combination of unknowns with a curvature below `least`,
+    per look, is not determined either.
     """
     kept = [i for i in range(hessian.shape[-1]) if i < channels or (i - reference) % channels]
     free = torch.tensor(kept, device=hessian.device)

@@ -212,7 +212,8 @@ def trade(
         axes.plot([s], [e], "o", color=colour, markerfacecolor=filled, markersize=7, label=f"{i}  {name}")
     axes.margins(0.12)
     low, high = (math.log10(x) for x in (points[0][0], points[-1][0]))
-    margin = max(0.12 * (high - low), 0.3)  # decades; at least so much that ticks of 1, 2, 5 show
+    # margin in decades, at least 0.3, so that ticks at 1, 2 and 5 appear
+    margin = max(0.12 * (high - low), 0.3)
     low, high = low - margin, high + margin
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high - low < 3 else (1,)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))

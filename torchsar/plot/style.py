@@ -27,8 +27,8 @@ INK, ACCENT, SECOND, THIRD, FAINT = "#1f2933", "#0b6e99", "#d1495b", "#e09f3e", 
 COLOURS = (ACCENT, SECOND, THIRD, "#4f7942", "#6a4c93", FAINT, "#8d5524", "#1aa6a6")
 # seven markers beside eight colours: more than eight curves still differ
 MARKERS, DASHES = "osD^vPX", ("--", ":", "-.")
-# widths in inches of a figure alone and of one panel among several: text of 9 points has at least 9
-# pixels where a page of 420 pixels leaves 386 of them
+# Widths in inches of a figure alone and of one panel among several. On a page 420 pixels wide,
+# which leaves 386 pixels for a figure, text of 9 points is at least 9 pixels high.
 ALONE, PANEL = 5.2, 3.9
 # pictures to scale become illegible when they are more elongated than this
 ELONGATED = 4.0

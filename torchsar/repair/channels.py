@@ -154,7 +154,9 @@ def estimate_imbalance(
 
 
 def _phases(product: Tensor, channels: int, doppler_cycles: Tensor | float | None) -> Tensor:
-    """Phases of the channels from the products of successive lines, (..., channel) each."""
+    """Phases of the channels relative to channel 0, from the products of successive lines. Both
+    have the shape (..., channel).
+    """
     angle = torch.angle(product)
     turns = torch.arange(channels, dtype=torch.float64, device=product.device) / channels
     rho = torch.angle(torch.polar(torch.ones_like(angle), angle).prod(-1))[..., None] / channels + 2 * math.pi * turns

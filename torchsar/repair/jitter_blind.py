@@ -118,10 +118,12 @@ def _taper(n: int, device: torch.device) -> Tensor:
 
 
 def _corrected_noise(m: int, n: int, device: torch.device, offsets: Tensor | None) -> Tensor:
-    """Spectra of impulses at the first M samples, corrected with offsets (..., M), (..., M, n).
+    """Spectra (..., M, n) of M impulses at the samples 0 to M - 1, after correction with the
+    offsets (..., M).
 
-    The correction repeats every M samples, so that the means over the M impulses of their power and
-    of their products at k / M apart are those of corrected white noise of unit power.
+    The correction repeats every M samples. Averages over the M impulses therefore give the power
+    spectrum of corrected white noise of unit power, and its correlation at frequencies k / M cycles
+    per sample apart.
     """
     impulse = torch.eye(m, n, dtype=torch.complex128, device=device)
     if offsets is not None:

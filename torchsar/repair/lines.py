@@ -32,7 +32,11 @@ def _shifted(x: Tensor, by: int, fill: int | bool) -> Tensor:
 
 
 def _contradictions(offset: Tensor, trusted: Tensor, reach: int, longest_gap: int, sign: int) -> tuple[Tensor, Tensor]:
-    """Number of accepted neighbours on one side that contradict each line, and of all of them."""
+    """Number of accepted neighbours on one side whose offset contradicts that of each line, and
+    number of all accepted neighbours there.
+
+    An offset contradicts if it falls, or rises by more than longest_gap.
+    """
     contradicting, count = torch.zeros_like(offset), torch.zeros_like(offset)
     for distance in range(1, min(reach, offset.shape[-1] - 1) + 1):
         accepted = _shifted(trusted, sign * distance, False)

@@ -70,9 +70,11 @@ class _Windows:
         return min(step, n_line), min(pairs, max(1, step // min(step, n_line)))
 
     def cut(self, start: Tensor, every: bool = False) -> Tensor:
-        """Cut sweeps of N samples from each start sample (..., o) on, (..., o, line, sweep, N), in
-        pairs of up and down sweep: all of them, or about MAX_WINDOWS. Lines are continued by their
-        last sample.
+        """Cut pairs of up and down sweeps of N samples that begin at the samples `start`, shape
+        (..., o) for o candidates.
+
+        Returns (..., o, line, sweep, N): all sweeps if `every`, otherwise about MAX_WINDOWS. Beyond
+        its end a line repeats its last sample.
         """
         n, device = self.radar.sweep_samples, self.lines.device
         line_step, pair_step = (1, 1) if every else self.steps()
@@ -219,7 +221,9 @@ def _sharpness(windows: _Windows, first: Tensor) -> Tensor:
 
 
 def _apex(windows: _Windows, near: Tensor, reach: int) -> Tensor:
-    """First sample (...,) of the sharpest sweeps: lines through both slopes meet there."""
+    """First sample (...,) of the sweeps with the sharpest spectra: the intersection of straight
+    lines fitted to the sharpness before and after `near`.
+    """
     step = max(1, reach // 8)
     offset = torch.tensor([*range(-8, -2), *range(3, 9)], device=near.device) * step
     start = (near[..., None] + offset).clamp(0, windows.radar.sweep_samples + 2 * windows.margin)

@@ -6,7 +6,7 @@ import importlib
 
 from torchsar.reproduce.item import Paper
 
-# by the system that follows each of them
+# names of the papers, each that of the system that reproduces it
 PAPERS = ("sal", "geo", "isal", "isal_rotation", "stripmap")
 
 

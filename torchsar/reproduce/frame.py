@@ -56,8 +56,10 @@ class _Frame(NamedTuple):
 
 
 def _raw(lines: int, samples: int, off_m_s: float, slab: int = 1024, step: int = 4096) -> Signal:
-    """Points, step range samples apart, are added to the noise in slabs that hold the echo of one,
-    which keeps the memory low. off_m_s: true over nominal velocity.
+    """Simulate noise with three points along track at every `step` range samples.
+
+    The echoes are computed in slabs of `slab` range samples to save memory. off_m_s: true minus
+    nominal velocity.
     """
     axes = SENSOR.raw_axes(lines, samples)
     noise = torch.Generator().manual_seed(1)

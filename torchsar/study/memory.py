@@ -33,7 +33,8 @@ def keep_freed_memory() -> bool:
     set_option = _of_c_library("mallopt")
     if set_option is None or {"MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_"} & set(os.environ):
         return False
-    # the threshold of trimming last: alone it would make every large block cost a mapping
+    # The trimming threshold is set last, and only if the mmap threshold was accepted. Alone it
+    # would make the C library map every large block separately.
     return (
         any(set_option(_MMAP_THRESHOLD, size) == 1 for size in (_KEPT_BYTES, _OLD_LIMIT_BYTES))
         and set_option(_TRIM_THRESHOLD, _KEPT_BYTES) == 1

@@ -15,13 +15,16 @@ from torch import Tensor
 from torchsar.compensate.path.search import Search, Starts, sharpness
 from torchsar.core import Estimate, Outcome, worst
 
-# Strehl ratio of a well-focused image, a convention (Marechal); number of standard deviations that
-# may not lower it below that, by choice: the difference of two starts is itself uncertain
+# The Strehl ratio for an error of _SPREAD standard deviations must be at least LEAST_STREHL, the
+# convention of Marechal. The factor is a choice, because the difference of two starts is itself
+# uncertain.
 LEAST_STREHL, _SPREAD = 0.8, 1.5
-# largest share of the pulses whose fringes the last round may have changed, and factor by which the
-# sharpest image may leave more of the samples than that of another start, by trial: 3 % and 1.1
-# where the result was right, 19 % and 3 in a wrong minimum that all starts had in common; and share
-# of the power that a fit may leave without noise: fits of right results left up to 0.2 % at 40 dB
+# RESTLESS: largest share of the pulses whose fringe the last round may have changed, by trial. It
+# was 3 % in correct results, and 19 % in a wrong minimum common to all starts.
+# _WORSE: largest ratio of the residual power of the sharpest image to that of another start, by
+# trial. It was 1.1 in correct results, and 3 in wrong ones.
+# _UNFIT: residual power allowed without noise, as a share of the power. It was up to 0.2 % in
+# correct fits at 40 dB.
 RESTLESS, _WORSE, _UNFIT = 0.1, 1.5, 0.003
 # fewest scatterers of a strip, and least share of the pulses that see one, by choice
 LEAST_SCATTERERS, _LEAST_SEEN = 3, 0.95

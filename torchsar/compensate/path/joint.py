@@ -181,7 +181,8 @@ class Motion:
         wide = unit.to(torch.complex128)
         normal = (wide.mH @ wide).real
         self.whole = or_one(normal[:, 0, 0])
-        # change of the line of sight by a unit of the axes across, (pulse, 2)
+        # Motion along the line of sight that has most nearly the same effect on the samples as a
+        # unit motion along each axis across, (pulse, 2).
         self.share = normal[:, 0, 1:] / self.whole[:, None]
         self.basis = cosines(pulses, pulses - 2, line_of_sight_m.device)
         power = expected_power((self.basis.mT @ line_of_sight_m).square())
@@ -242,7 +243,7 @@ def expected_power(power: Tensor) -> Tensor:
         Smooth power, never zero, float64 (cosine,).
     """
     order = torch.arange(2, 2 + len(power), dtype=torch.float64, device=power.device)
-    # over a share of the number of the coefficient, plus a number of coefficients
+    # the numbers of neighbours differ by at most a quarter of the number of the coefficient, plus 2
     near = (order[:, None] - order).abs() <= order[:, None] * 0.25 + 2
     mean = (near * power).sum(-1) / near.sum(-1)
     return mean.clamp_min(1e-9 * float(mean.max()) + 1e-18)
@@ -338,7 +339,8 @@ def scene_of(
     power = image.abs().square()
     weight = Wiener.filter(power, Wiener.level * or_one(power.mean()), -1)
     if noise is None:
-        # without its mean the weight leaves out what each pulse adds to its own model
+        # subtracting the mean weight of each range cell removes the contribution of each pulse to
+        # its own model
         echo = imaging.adjoint((image * (weight - weight.mean(-2, keepdim=True)))[None])[0]
         left = rows - echo * ((echo.conj() * rows).sum().real / or_one(_energy(echo)).to(power.dtype))
         noise = _noise(left, (1 - weight.double().mean()).square(), rows)
@@ -352,9 +354,10 @@ def scene_of(
 
 
 def _sizes(power: Tensor, rows: Tensor, noise: Tensor) -> Tensor:
-    """Standard deviations of cells of these powers, of which the energy of the samples is expected.
+    """Standard deviations of the cells in proportion to the root of `power`.
 
-    At least a thousandth of this energy is taken as echo.
+    They are scaled so that the expected energy of the echo is that of the samples minus the noise,
+    and at least a thousandth of that of the samples.
     """
     whole = _energy(rows)
     energy = (whole - noise * rows.numel()).clamp_min(1e-3 * whole)
@@ -362,8 +365,10 @@ def _sizes(power: Tensor, rows: Tensor, noise: Tensor) -> Tensor:
 
 
 def _noise(left: Tensor, share: Tensor, rows: Tensor) -> Tensor:
-    """Variance of the noise of which samples that a fit leaves hold this share, at least 1e-8 of
-    the samples: below it float32 rounds.
+    """Estimate the noise variance from the residual `left` of a fit, which contains the share
+    `share` of the noise.
+
+    It is at least 1e-8 of the mean power of the samples, the limit of float32.
     """
     return (_energy(left) / (left.numel() * share)).clamp_min(1e-8 * float(_energy(rows) / rows.numel()))
 

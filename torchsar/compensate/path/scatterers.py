@@ -31,8 +31,9 @@ def prominent_places(image: Tensor, grid: ImageGrid, cells: tuple[float, float],
         Positions in metres, float64 (scatterer, 3), the strongest one first.
     """
     power = power_of(image)
-    # the median of an exponential distribution is ln 2 of its mean; that of the image where a range
-    # has few pixels with samples
+    # The mean power of clutter is its median divided by ln 2 (exponential distribution). The median
+    # of each range cell is used, but at least that of the whole image, because few pixels of a
+    # range cell may have samples.
     clutter = power.median(0).values.clamp_min(power.median()) / math.log(2)
 
     def strongest(cells_near: tuple[int, int]) -> Tensor:

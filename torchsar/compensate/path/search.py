@@ -25,9 +25,9 @@ from torchsar.radar.spotlight import frequency_samples, range_profiles
 # roughness below which a line of sight is smooth: it was 0.3 to 0.6 for smooth errors, and 1.0 for
 # random walks
 _ROUGH = 0.75
-# factor by which another start may leave more of the samples than the sharpest image and still
-# count as a second opinion on it, by trial: those whose results were as good left up to 1.05 times
-# as much, those that had not come as far 1.1 to 1.35 times
+# A result of another start is compared with the best one only if its residual power is at most this
+# times as large, by trial. Results of equal quality had up to 1.05 times, less converged ones 1.1
+# to 1.35 times the residual power.
 _AS_WELL = 1.1
 
 
@@ -37,7 +37,9 @@ def _intensity(power: Tensor, mean: Tensor) -> Tensor:
 
 
 def _surprise(power: Tensor, mean: Tensor) -> Tensor:
-    """Weights of image cells that sharpen by the entropy, of those that are above its level."""
+    """Weights of image cells that lower the entropy: ln p minus the mean of ln p weighted by p, and
+    zero where this is negative. The share of a cell in the energy is p.
+    """
     share = power / (mean * (power.shape[-1] * power.shape[-2]))
     log = torch.log(share.clamp_min(torch.finfo(share.dtype).tiny))
     return (log - (share * log).sum((-2, -1), keepdim=True)).clamp_min(0)

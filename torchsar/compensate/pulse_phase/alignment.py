@@ -148,7 +148,9 @@ def _about_centroid(spectrum: Tensor) -> Tensor:
 
 
 def _common(halves: list[Tensor], count: Tensor) -> Tensor:
-    """Displacement in cells rms that both halves share, (trial,), of a number of free values."""
+    """Rms displacement in cells that both halves have in common, (trial,). It is zero unless their
+    correlation exceeds 3 standard deviations. count: number of free values.
+    """
     shared = (halves[0] * halves[1]).sum(-1)
     return torch.where(_agreement(halves, count) > 3, (shared / count.clamp_min(1)).sqrt(), 0)
 

@@ -96,11 +96,12 @@ def conclude(
     strehl = torch.exp(-std.square())
     outcome = worst(
         (Outcome.INEXACT, strehl <= LEAST_STREHL),
-        # in 99 % of the right trials with 3 to 25 points the gain was up to 2.2, and in 90 % of
-        # those in which a vehicle as strong as 30 points moves on its own beyond 2.4
+        # The gain was at most 2.2 in 99 % of the correct trials with 3 to 25 points. It exceeded
+        # 2.4 in 90 % of the trials in which a vehicle as strong as 30 points moves independently.
         (Outcome.PARTS_DISAGREE, gain > 2.2),
         (Outcome.HOMOGENEOUS, homogeneous > 0),
-        # beyond a gap of this share, scenes of many points do not tell how the phases go together
+        # If a gap is longer than this share of the record, many points do not determine the phase
+        # between the pulses before and after it.
         (Outcome.TOO_FEW, (unsteady > 0) | (gap > 0.36)),
         (Outcome.DISPLACED, (jitter >= LARGEST_JITTER) | (migration >= LARGEST_MIGRATION)),
         # the sharpness of noise is predicted within 15 %
@@ -296,9 +297,11 @@ def _from(again: Again, which: Tensor, halves: Sequence[Tensor], phase: Tensor) 
 def _disturbed(
     again: Again, which: Tensor, present: Tensor, halves: Sequence[Tensor], phase: Tensor
 ) -> Sequence[Tensor]:
-    """Phases of halves that continue from either side of the phase, two rounds at most.
+    """Estimate the phases of the two halves again, from the phase plus and minus a fixed walk of
+    0.4 rad rms, in at most two rounds.
 
-    What the scene does not hold stays apart, and weak targets are found again.
+    Components that the scene does not determine keep this difference. The others converge, also for
+    weak targets.
     """
     walk = _walk(phase)
     ends: Sequence[Tensor] = (phase + walk, phase - walk)

@@ -72,7 +72,7 @@ def describe(rows: Tensor, phase_rad: Tensor, independent: Tensor) -> tuple[Tens
         where the coherence of the pulses does not exceed that of noise. Shape (trial,) each.
     """
     n = rows.shape[-1]
-    if rows.shape[-2] > 256:  # the strongest rows are described
+    if rows.shape[-2] > 256:  # only the 256 strongest range cells are compared
         strongest = power_of(rows).sum(-1).topk(256, -1).indices
         rows = rows.gather(1, strongest[..., None].expand(-1, -1, n))
     energy = power_of(rows)

@@ -52,9 +52,10 @@ def link_phases(data: Tensor, *, start: Tensor | None = None, assess: bool = Tru
         assess: Whether to add the standard deviation and the outcome.
 
     Returns:
-        `phase_rad` of shape (..., pulse), to be removed. `info` holds, of shape (...,), "gain_nats"
-        (log likelihood minus that of white noise) and "fit_nats" (the same as if range cells were
-        independent, by which phases of one scene compare).
+        `phase_rad` of shape (..., pulse), to be removed. `info` holds two log likelihoods minus
+        that of white noise, of shape (...,). Both count only the share of the range cells that is
+        independent. For "fit_nats", by which phases of one scene compare, it is the share of the
+        band that is occupied. For "gain_nats" it also allows for the correlation of range cells.
 
         With `assess`, the standard deviation of each pulse is the Cramer-Rao bound for the
         estimated spectrum, in which range cells that depend on each other count less, raised by the
@@ -135,9 +136,11 @@ def linked(pulses: Pulses, start: Tensor | None = None, still: bool = False, ass
 
 
 def _linked(rows: Tensor, present: Tensor, start: Tensor | None, still: bool, assess: bool) -> tuple[Tensor, ...]:
-    """Phases (trial, pulse) of a block of trials, their log likelihood minus that of white noise as
-    if range cells were independent, the part of it that counts because they depend on each other,
-    (trial,) each, and what they tell, see `Judged`.
+    """Phases (trial, pulse) of a block of trials; two log likelihood gains over white noise,
+    (trial,); and the fields of `Judged`.
+
+    The first gain is multiplied by the share of the band that is occupied, the second one by the
+    share of the information of the range cells that is independent.
     """
     with torch.no_grad():
         scene = Speckle.of(rows.detach(), present)
@@ -195,11 +198,12 @@ def _solved(blocks: Speckle) -> Tensor:
 
 
 def _joined(pairs: Speckle, u: Tensor) -> Tensor:
-    """Phases of pairs of blocks, from phases that are right in each block but for a straight line.
+    """Join the phases of pairs of blocks, each correct except for a linear phase.
 
-    The spectra of both blocks are laid on each other for a common covariance. For each slope of the
-    second block, the best constant phase follows in closed form. With a matrix M and the phases a
-    and b of the blocks it leaves b^H M b - 2 |a^H M b|: two Fourier transforms over the slopes.
+    The spectrum of the second block is shifted circularly to match that of the first, and their sum
+    gives a common covariance. For each slope of the second block, the best constant phase follows
+    in closed form. With a matrix M and the phases a and b of the blocks it leaves b^H M b - 2 |a^H
+    M b|: two Fourier transforms over the slopes.
     """
     half, slopes = u.shape[-1] // 2, 4 * u.shape[-1]
     left, right = u[:, :half], u[:, half:]

@@ -32,7 +32,7 @@ from torchsar.core import Outcome, fft_lines, power_of, worst
 
 
 class Judged(NamedTuple):
-    """What a block of trials tells of its linked phases.
+    """Accuracy of linked phases, and quantities from which the outcome follows.
 
     Args:
         std: Standard deviation of the phase of each pulse in rad, (trial, pulse).
@@ -86,8 +86,9 @@ def judged(scene: Speckle, u: Tensor, fit: Fit, still: bool) -> Judged:
     looks = [
         scene.independent_share(u, fit, each, slice(k, k + 1)) * cells for k, (*_, cells) in enumerate(scene.groups)
     ]
-    # phases follow the noise of few cells and leave less of it, so that these seem to tell more;
-    # one cell alone tells nothing, and the square was found by trial
+    # The fitted phases absorb a part of the noise of a small group, whose information is then
+    # overestimated. It is reduced by 1 - 1 / n^2 for n independent cells and is zero for one. The
+    # square was found by trial.
     each = [own * (1 - count.clamp_min(1) ** -2)[:, None, None] for own, count in zip(each, looks, strict=True)]
     sharing = [count >= LEAST_LOOKS for count in looks]
     bend, slopes = _crossed(scene, u, fit, sharing)
@@ -111,8 +112,11 @@ def judged(scene: Speckle, u: Tensor, fit: Fit, still: bool) -> Judged:
 
 
 def _crossed(scene: Speckle, u: Tensor, fit: Fit, sharing: list[Tensor]) -> tuple[Tensor, Tensor]:
-    """Curvature (trial, pulse, pulse) of the likelihood, and its slope by the phases for each range
-    cell, (trial, pulse, range); each part of the cells by the spectra that the others fit.
+    """Curvature (trial, pulse, pulse) of the likelihood, and its gradient for each range cell
+    (trial, pulse, range).
+
+    The cells are divided into four parts. Each part is evaluated with the spectra fitted to the
+    other three (cross-validation).
     """
     bend, slopes = torch.zeros_like(scene.groups[0][1].real), torch.zeros_like(scene.groups[0][0].real)
     cells = torch.arange(slopes.shape[-1], device=u.device)
@@ -162,8 +166,9 @@ def outcome_of(
     outcome = worst(
         (Outcome.INEXACT, spread * (lost * alone).square() >= -math.log(LEAST_STREHL)),
         (Outcome.PARTS_DISAGREE, found.shift >= 1.5 * alone),
-        # the excess was 0.8 to 1.1 in 90 % of the scenes of clutter, 1.2 to 9 where each cell holds
-        # few scatterers; the scatter of more than 30 cells predicts the errors all the same
+        # The excess deviation was 0.8 to 1.1 in 90 % of the clutter scenes, and 1.2 to 9 where each
+        # cell holds few scatterers. With more than 30 cells, the scatter predicts the errors
+        # correctly in both cases.
         (Outcome.PARTS_DISAGREE, (found.excess >= 1.2) & (found.rows <= 30)),
         # the least coherence over all boundaries was 0.6 to 0.9 in homogeneous scenes, 0.1 to 0.5
         # in scenes that change at a pulse

@@ -158,9 +158,9 @@ class _Fit:
             solved = torch.linalg.solve_ex(matrix, waves.conj() @ rows.mT)[0]
             amplitudes = torch.where(active[:, None, None], solved, amplitudes)
             model = torch.where(active[:, None, None], (waves.mT @ amplitudes).mT, model)
-            # The phases stay where they start for three rounds, and until lines explain all but a
-            # quarter of the energy without noise: phases that make a line of one point out of ten
-            # hide the others.
+            # The phases are fitted only when the lines explain three quarters of the energy above
+            # the noise, which is tested in the third round. Phases fitted earlier would focus one
+            # point of ten and defocus the others.
             if number == 3:
                 unknown = power_of(rows - model).sum((-2, -1)) - self.noise * self.cells * (pulses - lines.shape[-1])
                 energy = power_of(self.rows).sum((-2, -1)) - self.cells * pulses * self.noise
@@ -198,7 +198,9 @@ class _Fit:
         return power_of(self.left).sum((-2, -1)) / or_one(self.noise * degrees)
 
     def of_second_range(self) -> Tensor:
-        """Deviation in rad of the phases that points tell beside those of one range, (trial,)."""
+        """Standard deviation in rad of the phases as far as they follow from a second, independent
+        range response, (trial,); infinite if there is none.
+        """
         amplitudes = self.amplitudes.to(torch.complex128)
         products = amplitudes @ amplitudes.mH
         # elementary symmetric polynomials of the eigenvalues: their sum, and that of their products
@@ -214,10 +216,11 @@ def _numbers(present: Tensor, dtype: torch.dtype) -> Tensor:
 
 
 def _turns(waves: Tensor, slopes: Tensor, matrix: Tensor, amplitudes: Tensor, left: Tensor) -> Tensor:
-    """Changes of the Dopplers in rad per pulse, (trial, line), that explain most of what is left.
+    """Gauss-Newton step of the Dopplers in rad per pulse, (trial, line), at most a quarter of a
+    Doppler cell.
 
-    A Gauss-Newton step: the slopes of the waves by their Dopplers, (trial, line, pulse) as these,
-    count without what the amplitudes can explain. matrix: products of the waves.
+    slopes: derivatives of the waves by their Dopplers, (trial, line, pulse) as `waves`. The part of
+    them that a change of the amplitudes explains is removed. matrix: inner products of the waves.
     """
     mixed = waves.conj() @ slopes.mT
     free = slopes.conj() @ slopes.mT - mixed.mH @ torch.linalg.solve_ex(matrix, mixed)[0]

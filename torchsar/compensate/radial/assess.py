@@ -93,7 +93,7 @@ def _variance(measured: Measured, pulse: Axis) -> Tensor:
     if law.intercept:
         return square
     away = measured.velocity_m_s - mirror_velocity(measured.product, "free")[0]
-    # that the edges of the window leave
+    # bias in m/s due to the edges of the range window
     bias = 5e-4 * measured.product.radar.ambiguous_velocity_m_s
     of_product = changes if law.changes is None else _changes_of_product(measured, "free")
     apart = mean_of(away.square() - variance(of_product) / share, clear) - bias**2

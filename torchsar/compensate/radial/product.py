@@ -78,9 +78,9 @@ def _slope(z: Tensor, u: Tensor, bands: Bands, steps: int) -> Tensor:
 
 
 def _through_zero(z: Tensor, u: Tensor, v: Tensor, bands: Bands) -> Tensor:
-    """The velocity of greatest Re sum z exp(-j w v) near v.
+    """Refine the velocity v to the one of greatest Re sum z exp(-j w v), with w of `_weights`.
 
-    The phase of the product is then zero at the turning point.
+    This is the likeliest velocity if the phase of z is zero at the turning point, where w = 0.
     """
     w = _weights(u, bands).to(z.real.dtype)
     for _ in range(3):  # by trial, enough to converge

@@ -184,7 +184,8 @@ def _start(cells: Tensor, coarse: Estimate, enough: Tensor, radar: TriangularLad
     far = enough & (4 * math.pi / radar.wavelength_m * walk_m > 0.4)
     if pulse.n < 32 or not bool(far.any()):
         return None
-    # in Doppler cells, by trial: a random walk blurs by few cells
+    # Widths of the PGA windows in Doppler cells, found by trial. They are narrow because a random
+    # walk of the phase blurs by few cells only.
     windows = (31.0, 21.0, 15.0, 9.0, 9.0, 9.0)
     found = pga(cells.detach(), windows=windows, iterations=6, assess=False)
     return torch.where(far[..., None], found["phase_rad"], 0)

@@ -104,10 +104,11 @@ def judged_fit(rows: Tensor, sampling: Sampling, fit: Fit, value: Mapping[str, T
     tiny = torch.finfo(torch.float64).tiny
     covariance = inverse / 2 * fit.noise[:, None, None]
     predicted = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(tiny)
-    # shares of the scatterers in what is known about each parameter, and what each asks for
-    # How far the errors of scatterers depend on each other, 0 to 1: those a few resolution cells
-    # apart, 8 in Doppler and 2 in range, share what the model does not describe; by trial: errors
-    # of a few scatterers side by side in Doppler are large, with opposite signs.
+    # shares: part of the information about each parameter that a scatterer contributes.
+    # own: change of the parameters from the residual of one scatterer.
+    # alike: assumed correlation of the errors of two scatterers, Gaussian over 8 cells in Doppler
+    # and 2 in range. Close scatterers share model errors. By trial, few adjacent ones in Doppler
+    # have large errors of opposite sign.
     lines, cells = (
         ((x[:, :, None] - x[:, None]) / reach).square() for x, reach in ((found.cell, 8.0), (found.row, 2.0))
     )
@@ -156,7 +157,8 @@ def _questioned(
     """
     count, order = found.used.sum(-1), judged.k.shape[-1]
     lag = found.pull.shape[-1] // 5  # samples of a history that share errors
-    # few scatterers cannot disagree: what the samples of each show counts as well
+    # With few scatterers, the scatter between them underestimates the variance. The scatter of the
+    # samples within each history is added.
     own = lag * torch.einsum("bpij,bpkj->bik", found.pull, found.pull)
     pull = found.pull.sum(-1)
     free = count / (count - found.inverse.shape[-1]).clamp_min(0.1)  # degrees of freedom of the fit

@@ -163,7 +163,9 @@ def _segments(n: int) -> tuple[int, int]:
 
 
 def _coarse(rows: Tensor, time: Tensor, sweep: float) -> tuple[Tensor, Tensor]:
-    """Frequency and rate of most power, summed over segments without their phases."""
+    """Find the frequency and the rate of the strongest chirp on a grid. The power spectra of the
+    segments are added without their phases.
+    """
     n = rows.shape[-1]
     segments, part = _segments(n)
     # a chirp half of a step away drifts by half a Doppler cell of the segments

@@ -142,9 +142,9 @@ def inner_products(
     # a separation just below the limit rounds to the last entry
     whole = position.floor().long().clamp_max(2 * _NEAR_CELLS * _TABLE - 1)
     weight = amplitude[near.trial, near.first].conj() * amplitude[near.trial, near.second]
-    # A part of 1e-3 is added to what a scatterer tells about itself and the rotation: the curvature
-    # stays positive definite where scatterers nearly cancel each other, and one alone is damped by
-    # no more.
+    # The product of a scatterer with itself is increased by 0.1 %. The curvature then remains
+    # positive definite where scatterers nearly cancel, and the step of a single scatterer is
+    # reduced by 0.1 % only.
     weight = torch.where(coupled, weight * (1 + 1e-3 * (near.first == near.second)), 0)
     index = [(n, m) for n in range(bases.shape[1]) for m in range(n, bases.shape[1])]
     # sums over pulses of b_n b_m exp(2j pi c u), m >= n, at steps of 1 / _TABLE of a Doppler cell c

@@ -31,8 +31,9 @@ from torchsar.focus.warped_sums import slow_times
 from torchsar.radar.warp import least_rate
 
 MOST, ROUNDS = 800, 12  # largest number of scatterers, number of steps; accuracy against time
-# rounds that search for further scatterers, and the share of their number up to which they do: the
-# brightest alone bring the motion near, and the rounds between let it converge
+# Iterations in which further scatterers are sought, and the fraction of the largest number up to
+# which they are added. The brightest ones bring the rotation near the solution, and the iterations
+# between let the fit converge.
 _SEARCHES = {0: 0.1, 2: 0.6, 4: 1.0}
 _SEARCHED = max(_SEARCHES)
 _STEP = 0.3  # largest motion of a scatterer in one step, in cells: beyond it the model is not linear

@@ -25,9 +25,10 @@ _ENTRIES = 97
 # distances from the last flat sample of a window at which its error is tabulated, in samples; a
 # pixel may lie up to one sample beyond it
 _DISTANCES = 0.5 * torch.arange(50, dtype=torch.float64, device="cpu") - 0.75
-# ridge of the fit of the nodes, above the rounding of double precision; beta relative to that of a
-# kernel whose band just ends at the oversampling, found by trial; 1 - u^2
-# below which the slope of the kernel, which is infinite at its end, is cut for gradients
+# _RIDGE: regularisation of the node fit, above the rounding of double precision.
+# _SHARPNESS: beta relative to that of a kernel whose band just ends at the oversampling, found by
+# trial.
+# _EDGE: least 1 - u^2 for gradients, because the slope of the kernel is infinite at its end.
 _RIDGE, _SHARPNESS, _EDGE = 1e-13, 0.96, 1e-12
 
 

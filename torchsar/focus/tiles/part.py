@@ -189,7 +189,9 @@ class Part:
 
     @property
     def rows(self) -> int:
-        """Number of nodes of a tile for each of its points along y: those of each point along x."""
+        """Number of rows of nodes of a tile for each interpolation point along y: the number of
+        points along x times the number of nodes.
+        """
         return self.choice.points[0] * self.nodes
 
     @untraced()

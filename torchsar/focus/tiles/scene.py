@@ -155,7 +155,8 @@ def pulse_weights(points: Tensor, pulses: int, lit: Lit | None, weight: Weight |
 
 @dataclass(frozen=True, eq=False)
 class Sampled:
-    """What the errors of sizes depend on, from a sample of tiles and pulses.
+    """Quantities that determine the errors of a choice of tile sizes, from a sample of tiles and
+    pulses.
 
     Args:
         error: Rms error of the expansion relative to 1.

@@ -24,8 +24,9 @@ from torchsar.radar.stripmap import LIGHT_M_S
 # tables of the pulses, and weights of the tiles, up to this size each (384 MB) are kept for the
 # next image, by choice: what a small machine spares
 _KEPT_BYTES = 3 << 27
-# tiles and trials whose pixels are formed at once, by choice: enough for the products, and few
-# enough that what is kept for gradients and by each thread is small
+# Number of pairs of tile and trial whose pixels are formed at once, by choice. It is large enough
+# for efficient matrix products, and small enough to limit the memory of each thread and of
+# gradients.
 _GROUP = 16
 # bytes of profiles that are formed at once, by choice: it limits the memory of the padded spectra
 _PROFILE_BYTES = 1 << 25
@@ -148,8 +149,11 @@ class Sector:
         return moved
 
     def _error_db(self, places: Sequence[Tensor]) -> float:
-        """Predicted error for other positions, each float64 (path, pulse, 3), that share what is
-        computed; infinite where they cannot.
+        """Predicted error in dB of the present plan for other positions, each float64 (path, pulse,
+        3).
+
+        It is infinite if they differ in number or leave the range of the nodes and windows of the
+        plan.
         """
         if [v.shape[1:] for v in places] != [v.shape[1:] for v in self._places]:
             return math.inf
@@ -179,7 +183,9 @@ class Sector:
         found: list[Tensor] = []
         given = [data, *self._places, self._reference_m, *([] if heights is None else [heights])]
         grad = torch.is_grad_enabled() and any(v.requires_grad for v in given)
-        # linear in the history alone, the graph holds what is kept anyway and the places of windows
+        # If only the history requires gradients, the autograd graph holds only the tables and
+        # weights, which are kept in any case, and the window indices. Otherwise the pixels are
+        # computed again in the backward pass.
         linear = trials <= _GROUP and not any(v.requires_grad for v in given[1:])
         linear = linear and self._tables.fits(data.dtype) and self._weights.fits(data.dtype)
         pixels = self._pixels if linear else partial(checkpoint, self._pixels, use_reentrant=False)

@@ -182,7 +182,8 @@ class _Job:
         disturbed = torch.zeros_like(tried)
         if not bool(tried.any()):
             return job, found, disturbed
-        # with a slant-range speed that is wrong by lambda PRF, one point leaves others over
+        # if the slant-range speed is wrong by lambda PRF, the residual of one point looks like
+        # further points
         found = _chosen_fit(self.resolved(found, None), found, tried)
         tried = tried & sample_whitening(self.left(found), self.radar).coloured
         points, left = found.motion.each(lambda value: value.expand(tried.shape)[..., None]), whole.left(found)

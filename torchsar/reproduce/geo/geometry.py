@@ -94,8 +94,10 @@ def _draw(speed: Tensor, shown: Mapping[str, tuple[str, str, Mapping[str, Tensor
 
 
 def _worst_phase_rad(u_r: Tensor | float, u_a: Tensor | float) -> Tensor:
-    """Largest phase within the integration time by which a filter for points at rest misses a
-    moving one that it puts where it appears.
+    """Largest phase difference in rad between a moving point and one at rest within the integration
+    time.
+
+    The term u_r t, which only displaces the image, is left out.
     """
     time = torch.linspace(-INTEGRATION_S / 2, INTEGRATION_S / 2, 201, dtype=torch.float64)
     point = _motion(u_r, u_a).each(lambda value: value[..., None])

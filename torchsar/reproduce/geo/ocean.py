@@ -85,7 +85,11 @@ def _levelled(image: Signal) -> Signal:
 
 
 def _figure_18(seen: _Seen, path: Path) -> list[Check]:
-    """What the motion that was found of each ship says; true and found velocities in words."""
+    """Draw Figure 18, and check for each ship with a slant-range speed that its velocity is found.
+
+    The displacement and the distance of the first false target, predicted from the velocity found,
+    must agree with the published values.
+    """
     middles = [(float(ship.range_m) + RADAR.reference_range_m, float(ship.azimuth_m)) for ship in seen.ships.values()]
     lines = {"true position": plot.boxes(middles, 60, 120)}
     named = {"everything at rest": seen.made.conventional, "without movers": seen.made.rest, "fused": seen.made.fused}

@@ -102,7 +102,7 @@ def _draw_spectra(signal: Signal, path: Path) -> None:
 
 
 def _intensity(signal: Signal, guesses: Tensor) -> Intensity:
-    """Of one trial, over guesses of u_r."""
+    """Intensities of the reconstructed signal of one trial for each assumed speed u_r."""
     data = signal.data[0, None, ..., None].expand(len(guesses), -1, -1, -1)
     return signal_intensity(data, RADAR, PointMotion.of(RADAR, data, guesses), LeastSquares(3), BANDWIDTH_HZ)
 

@@ -24,12 +24,14 @@ def _receiver_hz() -> float:
 
 
 def _delay_s() -> float:
-    """Of a channel against its neighbour."""
+    """Azimuth delay in s of a channel against its neighbour."""
     return (RADAR.channel_m[1] - RADAR.channel_m[0]) / RADAR.speed_m_s
 
 
 def _orbit(small: bool) -> list[float]:
-    """Largest |k1| to |k4| over an orbit, looking across the path, ahead and between."""
+    """Largest magnitudes of the range coefficients k1 to k4 over one orbit, for squints of 0, 45
+    and 90 degrees.
+    """
     turn_s = 2 * math.pi * math.sqrt(float(ORBIT.semi_major_m) ** 3 / EARTH_GRAVITY_M3_S2)
     time = torch.linspace(0, turn_s, 90 if small else 1440, dtype=torch.float64)
     looks = [seen_point(*ORBIT.state(time), OFF_NADIR_DEG, squint) for squint in (0.0, 45.0, 90.0)]
@@ -50,7 +52,9 @@ def _second_term(k: list[float], path: Path) -> list[Check]:
 
 
 def _scnr(seen: Columns, path: Path) -> list[Check]:
-    """Of 10 m/s, at the pulse rates of Table 2."""
+    """Check the relative error of a speed of 10 m/s that SIR finds at -10 dB, at the pulse rates of
+    Table 2.
+    """
     column = seen[1].index(-10.0)
     return [
         number(

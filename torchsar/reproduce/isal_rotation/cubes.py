@@ -193,7 +193,7 @@ def _width_m(seen: _Seen, name: str) -> float:
 
 
 def _table_5(seen: list[_Seen], path: Path) -> list[Check]:
-    """What the text says of it."""
+    """Check the rate of the turntable that the text gives."""
     return [number("rate of the turntable (deg/s)", 10.0, math.degrees(RATE_RAD_S), 1e-6)]
 
 

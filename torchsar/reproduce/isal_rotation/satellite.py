@@ -282,7 +282,11 @@ def _picture(factor: float) -> Callable[[_Seen, Path], list[Check]]:
 
 
 def _outcome(seen: _Seen, factor: float | None) -> list[Check]:
-    """Close to the truth: within 5 % in the mean; far from it: beyond it in every scene."""
+    """Checks of one start. From the truth, or without a start, the mean error of each parameter
+    must be within 5 %.
+
+    From other starts, the largest error must exceed 5 % in every scene.
+    """
     title = f"Newton's method {BEGINNINGS[factor]}" if factor else "recommended, without a start"
     percent, errors = 100 * CLOSE, 100 * seen.error[factor]
     if factor in (1.0, None):
@@ -298,7 +302,9 @@ def _table_2(seen: _Seen, path: Path) -> list[Check]:
 
 
 def _table_1(seen: list[_Imaged], path: Path) -> list[Check]:
-    """What the text says of it."""
+    """Compare the printed rate, acceleration and jerk with the printed estimates. The printed rate
+    is a misprint.
+    """
     shown = OMEGA_RAD_S * WARP_K[0] == 0.2 and OMEGA_RAD_S * WARP_K[1] == 20.0
     ours = (
         f"0.2 rad/s2 and 20 rad/s3 over the printed estimates {WARP_K[0]:g} 1/s and {WARP_K[1]:g} 1/s2 are "

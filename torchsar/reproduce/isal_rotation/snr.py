@@ -70,8 +70,10 @@ class _Target:
         return ladar(self.cell_m, self.prf_hz)
 
     def simulated(self, snr_db: float, seed: int, trials: Sequence[int]) -> tuple[Signal, Truth]:
-        """Trials are scenes, with noise of their own; their numbers make them, so that every SNR
-        sees the same.
+        """Simulate one scene per trial, each with its own noise.
+
+        A scene depends only on the seed and the number of the trial, so that it is the same at
+        every SNR.
         """
         world = TurntableWorld(
             Satellite(self.scatterers, self.half_width_m),
@@ -184,8 +186,10 @@ def _focused(signal: Signal, radar: InverseRadar, found: Estimate, trial: int) -
 
 
 def _small_target(small: bool) -> Errors:
-    """Genetic algorithms at the lowest and the highest SNR. Two scenes of a tiny target, and a
-    generation of six, in the reduced form.
+    """Errors of the recommended method at every SNR and those of the genetic algorithms at the
+    lowest and the highest SNR; and the bounds.
+
+    The reduced form has two scenes of the tiny target and a population of six.
     """
     target, trials, few, search = (TINY, 2, 2, (1, 6)) if small else (SMALL, TRIALS, GENETIC, (5, 30))
     ends = (SNR_DB[0], SNR_DB[-1])

@@ -339,8 +339,8 @@ class _Run:
                         count.update(self._written())
                     self.flush()
                     count.update(self._written())
-                    # batches never reach across a level that all points got to, so that an
-                    # extended sweep runs the same ones however often it is resumed
+                    # No batch extends across a number of trials that all points have completed. A
+                    # sweep that is resumed or extended therefore has the same batches.
                     self._about(finished=sorted({*self.record.about.get("finished", []), last}))
                     if last in stops[:-1]:
                         count.total -= (self.plan.trials - last) * self._drop_settled(last)

@@ -245,7 +245,7 @@ class Points(World):
         return MovingPoints(rows("u_r_m_s"), rows("u_a_m_s"), rows("azimuth_m"), rows("range_m"))
 
     def _sea(self, rows: Draws, snr: Tensor | None, truth: Truth, recording: Recording) -> Tensor:
-        """Echo of the sea with the range to the transmitter on its carrier."""
+        """Echo of the sea with the carrier phase of the transmit range."""
         assert self.sea is not None and snr is not None
         signal, gate = recording.signal, self.gate if self.sea_gate is None else self.sea_gate
         sea = replace(self.sea, power_db=self.sea.power_db - snr)  # pyright: ignore[reportCallIssue]

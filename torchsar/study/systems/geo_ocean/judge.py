@@ -337,7 +337,9 @@ def _errors(shown: ShownShip, found: FoundTarget | None, estimates: bool) -> dic
 
 
 def _levels(shown: ShownShip, made: MadeScene, still: Signal) -> dict[str, float]:
-    """What images hold where a ship is, was shown, and repeats."""
+    """Levels in dB of images at the true position of a ship; if it moves, also at its position in
+    the stationary image and at its replica.
+    """
 
     def of_lines(at: ImagePosition, reach_m: float) -> float:
         """Mean power in the image of what does not move, over all azimuths within reach_m in
