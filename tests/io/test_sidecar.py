@@ -334,7 +334,7 @@ MISTAKES: dict[str, tuple[dict[str, Any], list[str]]] = {
     "too few dims": ({"samples.dims": ["pulse", "range"]}, ["(12, 40, 2)", "samples.dims are ['pulse', 'range']"]),
     "wrong order": ({"samples.dims": ["iq", "pulse", "range"]}, ["the dim iq must have 2", "(12, 40, 2)"]),
     "a name": ({"samples.name": "iq/dat"}, ["has no array 'iq/dat'", "did you mean 'iq/data'"]),
-    "no name": ({"samples.name": None}, ["holds the arrays iq/data, ", "give name, one of them"]),
+    "no name": ({"samples.name": None}, ["holds the arrays iq/data, ", "give the name of one of them"]),
     "a layout": ({"samples.dtype": "int8"}, ["samples.dtype", "is a numpy file; give name instead"]),
     "a radar key": ({"radar.prf": 3.0}, ["radar: key 'prf' is not known", "did you mean 'prf_hz'"]),
     "another unit": ({"radar.prf_hz": "3 m"}, ["radar.prf_hz has the unit 'm', and Hz is expected", "kHz"]),

@@ -31,7 +31,7 @@ from torchsar.scene import (
 )
 from torchsar.scene.fluctuation import drawn_motion
 from torchsar.scene.ladar_range import RangeHistory
-from torchsar.study.names.registry import measured_track
+from torchsar.study.names.files import measured_track
 
 
 def test_the_letter() -> None:

@@ -122,13 +122,18 @@ def test_images_come_from_files(tmp_path):
             "two.npz",
             None,
             ValueError,
-            r"two.npz holds the arrays \['sea', 'complex'\]; give the name of one of them as key, got key=None",
+            r"two.npz \(numpy\) holds the arrays sea, complex; give the name of one of them",
         ),
-        ("two.npz", "land", ValueError, "got key='land'"),
+        ("two.npz", "land", ValueError, r"two.npz \(numpy\) has no array 'land'"),
         ("none.npy", None, FileNotFoundError, "none.npy does not exist"),
         ("cut.npz", "sea", ValueError, "cut.npz is cut off or damaged"),
-        ("words.npy", None, ValueError, r"words.npy must hold numbers, got <U4 of shape \(1, 2\)"),
-        ("text.npy", None, ValueError, "text.npy must be a numpy archive .* but it is a file of another kind"),
+        ("words.npy", None, ValueError, r"words.npy must hold numbers, got <U4"),
+        (
+            "text.npy",
+            None,
+            ValueError,
+            "text.npy cannot be read as an array or a picture: it is damaged or of another kind",
+        ),
     ):
         with pytest.raises(error, match=sentence):
             read_array(tmp_path / path, key)

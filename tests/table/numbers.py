@@ -45,6 +45,8 @@ REASONS: dict[str, str] = {
     "io.import_recording": "reads and writes files; tests/io/test_sidecar.py",
     "io.read_images": "reads a file; tests/io/test_export.py",
     "io.write_netcdf": "writes a file; tests/io/test_export.py",
+    "io.read_array": "reads a file; tests/scene/test_sea.py",
+    "io.read_points": "reads a file; tests/study/test_scene_files.py",
     "io.read_inverse": "reads a file; tests/io/test_damaged.py",
     "io.read_path": "reads a file; tests/io/test_damaged.py",
     "io.write_strip_geotiff": "writes a file; tests/io/test_geotiff.py",

@@ -172,8 +172,10 @@ def simulate_path(
         raise ValueError(f"a recording needs at least two pulses of two samples, got {n_pulse} and {n_range}")
     time_s = torch.arange(n_pulse, dtype=torch.float64, device=device) / radar.prf_hz
     flown = _Flown.of(world, draws, time_s)
-    y, x, amplitude = world.scene.scatterers(draws).to(device).tensors
-    points = torch.stack(torch.broadcast_tensors(x, y, world.ground.height_m(x, y)), -1)
+    scatterers = world.scene.scatterers(draws).to(device, heights=True)
+    y, x, amplitude = scatterers.tensors
+    above = 0.0 if scatterers.height_m is None else scatterers.height_m
+    points = torch.stack(torch.broadcast_tensors(x, y, world.ground.height_m(x, y) + above), -1)
     gain = _gain(world, flown.true, points, time_s)
     gain = gain * _within(flown.true, points, gain, radar, n_range)
     history = path_echo(flown.true, points, amplitude[..., None, :] * gain, radar, n_range, dtype)

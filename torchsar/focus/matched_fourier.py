@@ -401,6 +401,9 @@ class MatchedFourier(Stage):
         _check_weight(weight)
         DopplerLines(oversampling, lines)  # checks both
         self.radar, self.oversampling, self.lines, self.cross_range_m = radar, oversampling, lines, cross_range_m
+        if cross_range_m is not None:
+            step_m, count = cross_range_m
+            self.cross_range_m = step_m, round(count)  # numbers of a config are floats
         self.weight, self.transform = weight, transform
         _hold_given(self, omega_rad_s=radar.rotation_rad_s if omega_rad_s is None else omega_rad_s, warp_k=warp_k)
 

@@ -11,6 +11,7 @@ CPHD, a phase history                `read_cphd`, `write_cphd`
 SICD, a complex image                `read_sicd`, `write_sicd`
 HDF5, MATLAB, numpy, flat binary     `import_recording`, which writes an .npz file
 sweeps of an FMCW board              `fmcw_recording`
+image or points of a scene           `read_array`, `read_points`
 images of a run (zarr)               `read_images`
 image for other programs             `write_geotiff`, `write_netcdf`
 strip longer than memory             `StripImage`, `write_strip_geotiff`
@@ -25,6 +26,7 @@ from torchsar.io.geotiff import write_geotiff, write_strip_geotiff
 from torchsar.io.inverse import read_inverse
 from torchsar.io.netcdf import write_netcdf
 from torchsar.io.path import read_path
+from torchsar.io.plain import read_array, read_points
 from torchsar.io.recorded import read_stripmap
 from torchsar.io.sicd import read_sicd
 from torchsar.io.sidecar import import_recording
@@ -37,11 +39,13 @@ __all__ = [
     "fmcw_recording",
     "import_recording",
     "read",
+    "read_array",
     "read_cphd",
     "read_history",
     "read_images",
     "read_inverse",
     "read_path",
+    "read_points",
     "read_sicd",
     "read_stripmap",
     "write_cphd",

@@ -101,7 +101,7 @@ class Container:
             names = list(self.names()) if name is None else [name]
             if len(names) != 1:
                 raise ValueError(
-                    f"{self.path} ({self.kind}) holds the arrays {', '.join(names)}; give name, one of them"
+                    f"{self.path} ({self.kind}) holds the arrays {', '.join(names)}; give the name of one of them"
                 )
             name = names[0]
             try:
@@ -110,8 +110,9 @@ class Container:
                 hint = did_you_mean(name.strip("/"), self.names())
                 raise ValueError(f"{self.path} ({self.kind}) has no array {name!r}{hint}") from None
         dtype, shape = getattr(array, "dtype", None), getattr(array, "shape", None)
+        what = f"{self.path}: {name}" if name else f"{self.path}"
         if not isinstance(dtype, np.dtype) or shape is None:
-            raise ValueError(f"{self.path}: {name} must hold numbers, got {type(array).__name__}")
+            raise ValueError(f"{what} must hold numbers, got {type(array).__name__}")
         fields = dtype.names or ()
         if len(fields) == 2 and tuple(field.lower() for field in fields) in _PARTS:
             dtype = complex_type(np.result_type(*(dtype[field] for field in fields)))
@@ -122,7 +123,7 @@ class Container:
 
             return BlockArray(self.path, self.kind, name, tuple(shape), dtype, complex_part)
         if dtype.kind not in "iufc":
-            raise ValueError(f"{self.path}: {name} must hold numbers, got {dtype}")
+            raise ValueError(f"{what} must hold numbers, got {dtype}")
         return BlockArray(self.path, self.kind, name, tuple(shape), dtype, part)
 
 

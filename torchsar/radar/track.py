@@ -89,7 +89,8 @@ def read_track(file: str | Path, origin: Sequence[float] | None = None) -> Track
             latitudes and longitudes are none.
     """
     path = Path(file)
-    columns = _known(read_table(path))
+    held = read_table(path)
+    columns = _known(dict(zip("txyz", held.values())) if [*held] == ["0", "1", "2", "3"] else held)
     earth = "latitude" in columns
     wanted = ("time", *(("latitude", "longitude", "height") if earth else ("x", "y", "z")))
     missing = [name for name in wanted if name not in columns]
@@ -172,11 +173,8 @@ def read_table(path: Path) -> dict[str, np.ndarray]:
 
 
 def _numbered(table: np.ndarray) -> dict[str, np.ndarray]:
-    """Columns of a table without names; four are time and coordinates."""
-    if table.ndim != 2:
-        return {}
-    names = ("t", "x", "y", "z") if table.shape[1] == 4 else map(str, range(table.shape[1]))
-    return dict(zip(names, table.T))
+    """Columns of a table without names, by their numbers."""
+    return {} if table.ndim != 2 else dict(zip(map(str, range(table.shape[1])), table.T))
 
 
 def _value(cell: str) -> float:

@@ -20,8 +20,8 @@ world seen from any path          `PathWorld` with a `Flight`, its `Navigation`,
                                   a `SideBeam`
 path of an antenna                `StraightPath`, `CircularPath`, `RecordedPath`; `Sway`, with
                                   `Jitter`, `RandomWalk`, `Offset` and the motions below
-point targets                     `Points`, `RandomPoints`; `Together` joins a `Scene` with others;
-                                  they become `Scatterers`
+point targets                     `Points`, `RandomPoints`; `PointCloud` of an array or an image;
+                                  `Together` joins a `Scene` with others; they become `Scatterers`
 surface                           `Speckle`, `KSea`, `ImageReflectivity`
 moving points and ships           `MovingPoints`, `Ship`, `GroundMovers`; `Fleet` joins them
 models of targets                 `Aircraft`, `Satellite`, `SpreadRows`, `LetterE`,
@@ -68,7 +68,7 @@ from torchsar.scene.rotation import PolynomialRotation
 from torchsar.scene.satellite import Satellite
 from torchsar.scene.sea import ImageReflectivity, KSea
 from torchsar.scene.strip import AlwaysLit, Antenna, Dwell, Hyperbola, Parabola, StripmapWorld
-from torchsar.scene.targets import Points, RandomPoints, Scatterers, Scene, Speckle, Together
+from torchsar.scene.targets import PointCloud, Points, RandomPoints, Scatterers, Scene, Speckle, Together
 from torchsar.scene.turntable import Dechirped, PhaseOnly, TurntableWorld
 from torchsar.scene.vibration import Motion, Polynomial, Sinusoid, StartPhase, UniformStartPhase
 
@@ -109,6 +109,7 @@ __all__ = [
     "Pattern",
     "PhaseOnly",
     "PlaneGround",
+    "PointCloud",
     "Points",
     "Polynomial",
     "PolynomialRotation",

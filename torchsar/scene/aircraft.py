@@ -7,15 +7,14 @@ exp(-4j pi x sin(theta) / lambda).
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from torchsar.core import Draws
-from torchsar.scene.targets import Scatterers, Scene, unit_phases
-from torchsar.scene.trials import either, finite_numbers, refuse_unless, stacked, with_dims
+from torchsar.scene.targets import Scatterers, Scene, turned, unit_phases
+from torchsar.scene.trials import finite_numbers, refuse_unless, with_dims
 
 # one half of the outline from nose to tail, and the fin from above, along the fuselage in lengths
 # and across it in half spans; chosen here, as the publication gives no coordinates
@@ -100,9 +99,7 @@ class Aircraft(Scene):
         side, fin = (torch.tensor(line, dtype=torch.float64) for line in (_SIDE, _FIN))
         lines = (side, side * torch.tensor([1.0, -1.0], dtype=torch.float64), fin)
         points = torch.cat([along_line(scale * line, self.spacing_m) for line in lines])
-        turn = either(self.heading_deg, math.radians, torch.deg2rad)
-        cos, sin = either(turn, math.cos, torch.cos), either(turn, math.sin, torch.sin)
-        return points @ stacked([cos, sin, -sin, cos]).unflatten(-1, (2, 2))
+        return turned(points, self.heading_deg)
 
     def scatterers(self, draws: Draws) -> Scatterers:
         points = self.outline()

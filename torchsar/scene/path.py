@@ -144,9 +144,9 @@ class PathWorld:
     >>> echo.simulate_path(imager, world, 64, 16, Draws(seed=1))[0].signal.data.shape
     torch.Size([64, 16])
 
-    A scatterer lies at x = range, y = azimuth, z = height of the ground. The middle of the range
-    window, to which phases refer, follows the point (0, 0, 0) as navigation sees it, or has a
-    constant range. Echoes beyond the window are not recorded.
+    A scatterer lies at x = range, y = azimuth, z = height of the ground and of the scatterer above
+    it. The middle of the range window, to which phases refer, follows the point (0, 0, 0) as
+    navigation sees it, or has a constant range. Echoes beyond the window are not recorded.
 
     Args:
         scene: Scatterers.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchsar.core import Draws
 from torchsar.scene.trials import (
+    either,
     finite,
     finite_numbers,
     refuse_unless,
@@ -41,6 +42,8 @@ class Scatterers:
         range_m: Range in metres at which the beam centre crosses the scatterer, shape (...,
             target), float64.
         amplitude: Amplitude, shape (..., target), complex.
+        height_m: Height above the ground in metres, shape (..., target), float64; None for points
+            on the ground. Only worlds seen from any path have heights.
 
     Raises:
         TypeError: If positions are not float64 or amplitudes not complex.
@@ -50,6 +53,7 @@ class Scatterers:
     azimuth_m: Tensor
     range_m: Tensor
     amplitude: Tensor
+    height_m: Tensor | None = None
 
     def __post_init__(self) -> None:
         shapes = {tuple(x.shape) for x in self.tensors}
@@ -64,11 +68,24 @@ class Scatterers:
         """Azimuth, range and amplitude."""
         return self.azimuth_m, self.range_m, self.amplitude
 
-    def to(self, device: torch.device | str | None) -> Scatterers:
-        """Return the scatterers on a device; raises ValueError if there are none."""
+    def to(self, device: torch.device | str | None, heights: bool = False) -> Scatterers:
+        """Return the scatterers on a device.
+
+        Args:
+            device: The device.
+            heights: Whether the world has heights.
+
+        Raises:
+            ValueError: If there are none, or they have heights that the world does not have.
+        """
         if not self.azimuth_m.shape[-1]:
             raise ValueError("the scene holds no scatterer; give it at least one")
-        return Scatterers(*(x.to(device) for x in self.tensors))
+        if self.height_m is not None and not heights:
+            raise ValueError(
+                "scatterers have heights, which only a world seen from any path has; give azimuths and ranges alone"
+            )
+        height = None if self.height_m is None else self.height_m.to(device)
+        return Scatterers(*(x.to(device) for x in self.tensors), height_m=height)
 
 
 def unit_phases(turns: Tensor) -> Tensor:
@@ -147,6 +164,127 @@ class Points(Scene):
         turns = draws.uniform("scene.points.phase", x.shape[-1:]) if self.random_phase else torch.zeros_like(x)
         x, r, level, turns = torch.broadcast_tensors(x, r, level, turns)
         return Scatterers(x, r, torch.polar(level, 2 * math.pi * turns))
+
+
+def turned(place_m: Tensor, heading_deg: Tensor | float) -> Tensor:
+    """Turn places from positive azimuth towards positive range.
+
+    Args:
+        place_m: Azimuth and range in metres, shape (point, 2), float64.
+        heading_deg: Angle in degrees, or one per trial, shape (...,).
+
+    Returns:
+        Turned places in metres, shape (..., point, 2).
+    """
+    turn = either(heading_deg, math.radians, torch.deg2rad)
+    cos, sin = either(turn, math.cos, torch.cos), either(turn, math.sin, torch.sin)
+    return place_m @ stacked([cos, sin, -sin, cos]).unflatten(-1, (2, 2))
+
+
+@dataclass(frozen=True, eq=False)
+@finite_numbers("a point cloud")
+class PointCloud(Scene):
+    """Point scatterers at the places of an array, such as that of `torchsar.io.read_points`.
+
+    >>> from torchsar import Draws, scene
+    >>> cloud = scene.PointCloud([[0.0, 0.0], [3.0, 0.0]], heading_deg=90.0, range_m=5.0)
+    >>> cloud.scatterers(Draws(seed=1)).range_m.round().tolist()
+    [5.0, 8.0]
+
+    The cloud is turned about its origin and then displaced. Unlike those of `Points`, its points
+    have no names and are not measured one by one.
+
+    Args:
+        place_m: Azimuth (or cross range) and range in metres, and height above the ground if
+            wanted: an array or a tensor of shape (point, 2) or (point, 3).
+        amplitude: Amplitudes, real or complex, shape (point,); None for 1.
+        azimuth_m: Azimuth in metres of the origin of the cloud.
+        range_m: Range in metres of its origin.
+        heading_deg: Angle in degrees by which it is turned, from positive azimuth towards positive
+            range.
+        fluctuation: Factor of the amplitudes that each trial draws: "phase" for a random phase of
+            every point, "speckle" for circular Gaussian numbers of unit mean power, or "none".
+
+    Raises:
+        ValueError: If shapes do not agree, there is no point, a number is not finite, or the
+            fluctuation is unknown.
+    """
+
+    place_m: Any
+    amplitude: Any = None
+    azimuth_m: Tensor | float = 0.0
+    range_m: Tensor | float = 0.0
+    heading_deg: Tensor | float = 0.0
+    fluctuation: Literal["phase", "speckle", "none"] = "phase"
+
+    def __post_init__(self) -> None:
+        place = torch.as_tensor(self.place_m, dtype=torch.float64)
+        level = torch.as_tensor(1.0 if self.amplitude is None else self.amplitude).to(torch.complex128)
+        if (
+            place.ndim != 2
+            or not len(place)
+            or place.shape[1] not in (2, 3)
+            or level.shape not in ((), place.shape[:1])
+        ):
+            raise ValueError(
+                "place_m of a point cloud must have the shape (point, 2) or (point, 3) and amplitude (point,), got "
+                f"{tuple(place.shape)} and {tuple(level.shape)}"
+            )
+        if not bool(torch.isfinite(place).all() and torch.isfinite(level.abs()).all()):
+            raise ValueError("place_m and amplitude of a point cloud must be finite; remove points with NaN or inf")
+        if self.fluctuation not in ("phase", "speckle", "none"):
+            raise ValueError(f"fluctuation must be 'phase', 'speckle' or 'none', got {self.fluctuation!r}")
+        object.__setattr__(self, "place_m", place)
+        object.__setattr__(self, "amplitude", level.expand(len(place)))
+
+    @staticmethod
+    def of_image(
+        amplitude: Any, azimuth_extent_m: float, range_extent_m: float, floor_db: float = -40.0, **keys: Any
+    ) -> PointCloud:
+        """Make a point of every pixel of an image that is bright enough.
+
+        >>> from torchsar import scene
+        >>> scene.PointCloud.of_image([[0.0, 2.0], [0.0, 0.0]], 20.0, 40.0).place_m.tolist()
+        [[-5.0, 10.0]]
+
+        The simulation takes the time of as many targets.
+
+        Args:
+            amplitude: Image of amplitudes, real or complex, an array or a tensor of shape (azimuth,
+                range).
+            azimuth_extent_m: Azimuth extent of the image in metres; its middle is the origin.
+            range_extent_m: Range extent of the image in metres; its middle is the origin.
+            floor_db: Level in dB relative to the brightest pixel, at or below which a pixel is left
+                out.
+            **keys: Further arguments of the cloud.
+
+        Returns:
+            The cloud, with points in the middles of pixels.
+
+        Raises:
+            ValueError: If the image has another number of dimensions, no pixel above zero, or NaN.
+        """
+        image = torch.as_tensor(amplitude)
+        level = image.abs().to(torch.float64)
+        bright = level > 10 ** (floor_db / 20) * level.max() if level.numel() else level
+        if image.ndim != 2 or not bool(bright.any()):
+            raise ValueError(
+                "an image must have the shape (azimuth, range) and finite pixels, some of them not zero, got shape "
+                f"{tuple(image.shape)} with a largest magnitude of {float(level.max()) if level.numel() else 0:g}"
+            )
+        at, shape = bright.nonzero(), level.new_tensor(image.shape)
+        place = ((at + 0.5) / shape - 0.5) * level.new_tensor([azimuth_extent_m, range_extent_m])
+        return PointCloud(place, image[bright], **keys)
+
+    def scatterers(self, draws: Draws) -> Scatterers:
+        place, count = turned(self.place_m[:, :2], self.heading_deg), self.place_m.shape[:1]
+        x, r = (place[..., i] + with_dims(v, 1, place) for i, v in enumerate((self.azimuth_m, self.range_m)))
+        amplitude = self.amplitude
+        if self.fluctuation == "phase":
+            amplitude = amplitude * unit_phases(draws.uniform("scene.cloud.phase", count))
+        elif self.fluctuation == "speckle":
+            amplitude = amplitude * draws.normal("scene.cloud.amplitude", count, torch.complex128)
+        return Scatterers(x, r, amplitude, self.place_m[:, 2] if self.place_m.shape[1] == 3 else None)
 
 
 @dataclass(frozen=True)
@@ -268,7 +406,11 @@ class Together(Scene):
     def scatterers(self, draws: Draws) -> Scatterers:
         parts = [scene.scatterers(draws.part(name)) for name, scene in self.parts.items()]
         trials = np.broadcast_shapes(*(x.shape[:-1] for part in parts for x in part.tensors))
-        return Scatterers(*(joined(kind, trials) for kind in zip(*(part.tensors for part in parts), strict=True)))
+        height = None
+        if any(part.height_m is not None for part in parts):
+            height = joined([torch.zeros_like(p.range_m) if p.height_m is None else p.height_m for p in parts])
+        three = (joined(kind, trials) for kind in zip(*(part.tensors for part in parts), strict=True))
+        return Scatterers(*three, height_m=height)
 
 
 def joined(parts: Sequence[Tensor], trials: Sequence[int] = ()) -> Tensor:

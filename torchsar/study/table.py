@@ -52,6 +52,9 @@ systems: Mapping[str, System] = _Systems()
 def load(name: str | Path, overrides: Sequence[str] = ()) -> Loaded:
     """Read, override and check a config.
 
+    Its files are sought from its folder, and then from the current one; those of overrides only
+    from the current one.
+
     Args:
         name: A YAML file, or the name of a packaged config.
         overrides: key=value with dotted keys and YAML values.
@@ -65,10 +68,20 @@ def load(name: str | Path, overrides: Sequence[str] = ()) -> Loaded:
     """
     path = find_config(str(name))
     settings = [field for field in Sweep.model_fields if field != "grid"]
-    tree = override(read_tree(path), overrides, literal=("sweep", "grid", settings))
+    tree = override(_beside(read_tree(path), path.parent), overrides, literal=("sweep", "grid", settings))
     file = str(path) + (f" with {' '.join(overrides)}" if overrides else "")
     system = _system_of(tree, file)
     return Loaded(checked(tree, system, file), system, file, path.stem)
+
+
+def _beside(tree: Any, folder: Path, key: str = "") -> Any:
+    """A config in which the files that lie beside it, or below its folder, have their paths."""
+    if isinstance(tree, dict):
+        return {name: _beside(part, folder, name) for name, part in tree.items()}
+    if isinstance(tree, list):
+        return [_beside(part, folder, key) for part in tree]
+    found = key.rpartition(".")[2] == "file" and isinstance(tree, str) and (folder / tree).is_file()
+    return str(folder / tree) if found else tree
 
 
 def _system_of(tree: Any, file: str) -> System:

@@ -16,7 +16,6 @@ from functools import cache, wraps
 from importlib.metadata import entry_points
 from typing import Annotated, Any, Literal
 
-import torch
 from torch import Tensor
 
 from torchsar import compensate, echo, focus, multichannel, repair, scene
@@ -24,7 +23,6 @@ from torchsar.compensate import Autofocus, EffectiveVelocity, RotationAutofocus,
 from torchsar.compensate.pulse_phase import CorrectPulsePhase
 from torchsar.core import Alternate, Stage, Turn
 from torchsar.focus import OmegaK, PaddedLines, TargetImage
-from torchsar.io.plain import measured_displacement, read_array
 from torchsar.multichannel import (
     AlongTrackAutofocus,
     Detector,
@@ -41,9 +39,10 @@ from torchsar.multichannel import (
 from torchsar.multichannel.reconstruct import Rebuild
 from torchsar.multichannel.scene_image import MoversImage
 from torchsar.multichannel.velocity.aperture import ELEMENT_BEAM, Expected
-from torchsar.radar import LIGHT_M_S, BistaticRadar, FarField, InverseRadar, Spotlight, StripmapRadar, read_track
-from torchsar.scene import Dechirped, ImageReflectivity, KSea, MeasuredTrack, Polynomial, RecordedPath, Sinusoid
+from torchsar.radar import LIGHT_M_S, BistaticRadar, FarField, InverseRadar, Spotlight, StripmapRadar
+from torchsar.scene import Dechirped, KSea, Polynomial, Sinusoid
 from torchsar.scene.fluctuation import RandomMotion
+from torchsar.study.names.files import image_scene, image_sea, measured_track, point_cloud, recorded_path
 from torchsar.study.settings.errors import loading
 from torchsar.study.settings.signature import Catalogue, Section, snake
 
@@ -303,66 +302,6 @@ def k_sea(
     return KSea(power_db=cnr_db, shape=shape, cell_m=cell_m, margin_s=margin_s, lobes=lobes)
 
 
-def measured_track(file: str) -> MeasuredTrack:
-    """Measured displacement at equally spaced times, interpolated by a cubic spline.
-
-    Args:
-        file: Text or .csv file of two columns, times in seconds and displacements in metres
-            (separated by commas or blanks, a line of names is allowed), .npy file of shape (n, 2),
-            or .npz file with `time_s` (n,) and `displacement_m` (..., n).
-    """
-    time_s, displacement_m = (torch.as_tensor(x, dtype=torch.float64) for x in measured_displacement(file))
-    try:
-        return MeasuredTrack(time_s, displacement_m)
-    except ValueError as problem:
-        raise ValueError(f"{file}: {problem}") from None
-
-
-def recorded_path(file: str, origin: Sequence[float] | None = None, start_s: float | None = None) -> RecordedPath:
-    """Path of a motion log, between whose records cubic splines interpolate.
-
-    Args:
-        file: Table (.csv, text, .npz) with the columns time, x, y, z in s and m, or time, latitude,
-            longitude, height in s, degrees and m, see `torchsar.radar.read_track`.
-        origin: Origin of the coordinates of the world: x, y, z, or latitude, longitude, height;
-            null for that of the log, or the place of its first record at height 0.
-        start_s: Time of the first pulse on the clock of the log; null for the first record.
-    """
-    try:
-        return RecordedPath(read_track(file, origin), start_s)
-    except OSError as error:
-        raise ValueError(str(error)) from None
-
-
-def image_sea(
-    file: str,
-    azimuth_extent_m: Tensor | float,
-    range_extent_m: Tensor | float,
-    cnr_db: Tensor | float = 30.0,
-    key: str | None = None,
-    margin_s: float | None = None,
-    lobes: int = 1,
-) -> ImageReflectivity:
-    """Surface whose mean intensity is the image in a .npy or .npz file.
-
-    Args:
-        file: Path of the file.
-        azimuth_extent_m: Along-track extent of the image in metres.
-        range_extent_m: Range extent of the image in metres.
-        cnr_db: Clutter-to-noise ratio of a range-compressed sample in dB.
-        key: Name of the array in an .npz file of several arrays.
-        margin_s: Time in s by which the surface extends beyond the record at both ends; None to
-            reach to the edge of the illumination.
-        lobes: Number of nulls of the antenna pattern, to either side of its maximum, up to which
-            the antenna illuminates the surface.
-    """
-    try:
-        keys = {"power_db": cnr_db, "margin_s": margin_s, "lobes": lobes}
-        return ImageReflectivity(read_array(file, key), azimuth_extent_m, range_extent_m, **keys)
-    except OSError as error:
-        raise ValueError(f"the image {file!r} cannot be read: {error.strerror or error}") from None
-
-
 def with_wavelength(radar: type) -> Callable[..., Any]:
     """Return the constructor of a radar with `wavelength_m` as an alternative to `carrier_hz`.
 
@@ -406,6 +345,8 @@ SCENES = Catalogue(
         scene.SpreadRows,
         scene.LetterE,
         scene.RetroAndBrokenLine,
+        point_cloud,
+        image_scene,
     ),
 )
 BEAMS = Catalogue("beam", "kind", (scene.AlwaysLit, scene.Dwell, scene.Antenna))
