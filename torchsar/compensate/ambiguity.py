@@ -57,10 +57,11 @@ from torchsar.radar import StripmapRadar
 def _evidence(scores: Tensor, weight: Tensor | None = None) -> Tensor:
     """Log-likelihood of each candidate (..., candidate) from the scores of blocks.
 
-    It says how certainly a candidate is worse than the best one. scores: (..., block, candidate).
-    weight: (..., block) with sum 1, equal by default. The value is Student's t of the mean deficit;
-    its degrees of freedom follow from the number of blocks that carry weight. A tenth of the
-    deficit is added to its uncertainty, so that no single kind of evidence becomes a certainty.
+    The likelihood describes how certainly a candidate is worse than the best one. scores: (...,
+    block, candidate). weight: (..., block) with sum 1, equal by default. The value is Student's t
+    of the mean deficit. Its degrees of freedom follow from the number of blocks that carry weight.
+    A tenth of the deficit is added to its uncertainty, so that no single kind of evidence becomes a
+    certainty.
     """
     if weight is None:
         weight = torch.full(scores.shape[:-1], 1 / scores.shape[-2], dtype=scores.dtype, device=scores.device)
@@ -263,7 +264,7 @@ class DopplerCentroid(Stage):
             )
         if reach < 1:
             raise ValueError(f"reach must be 1 or more (largest Doppler ambiguity to search, in PRFs), got {reach}")
-        # up to 70 degrees of squint: the absolute Doppler is then at most 0.94 * 2 v / lambda
+        # for up to 70 degrees of squint, at which the absolute Doppler is 0.94 * 2 v / lambda
         most = math.floor(1.88 * radar.velocity_m_s / (radar.wavelength_m * radar.prf_hz) - 0.5)
         self.radar, self.reference, self.reach = radar, reference, max(0, min(reach, most))
         self.blocks, self.assess = blocks, assess
@@ -286,13 +287,14 @@ class DopplerCentroid(Stage):
               `ambiguity_evidence`;
             - "candidates": the candidates for the ambiguity in PRFs, shape (candidate,).
 
-            The assessment adds standard deviations of both centroids, the probability that the
-            ambiguity is right as `quality`, and to `info` "cut_hz" (see `phase_increment`),
+            The assessment adds standard deviations of both centroids, and the probability that the
+            ambiguity is right as `quality`. To `info` it adds "cut_hz" (see `phase_increment`),
             "margin" (log-likelihood of the best candidate minus that of the second-best) and
             "coherence" (of adjacent lines, 0..1). The outcome is EMPTY or NOISE where the phases of
-            the lines are random, AMBIGUOUS where the probability is 0.9 or less, MISFIT where the
-            apertures that the ends of the record cut shift the centroid by an eighth of the band of
-            the beam or more, and INEXACT from a standard deviation of 1.5 % of the PRF on.
+            the lines are random, and AMBIGUOUS where the probability is 0.9 or less. It is MISFIT
+            where the apertures that the ends of the record cut shift the centroid by an eighth of
+            the band of the beam or more. It is INEXACT from a standard deviation of 1.5 % of the
+            PRF on.
         """
         radar, raw = self.radar, checked_samples(signal.data, "DopplerCentroid", "pulse, range")
         n, prf = raw.shape[-1], radar.prf_hz

@@ -46,16 +46,17 @@ def complete_aperture_centroid(
 
     Returns:
         The refined centroid and its standard deviation in Hz, shape (...,) each. There are no such
-        targets, so that `doppler_hz` and infinity are returned, if the dwell of the beam is not
-        known (`radar.integration_s` is None), if the record is shorter than 1.15 dwells, and in
-        trials where the targets migrate out of the swath in more than half of the range cells or
-        less than a tenth of the energy is that of such targets.
+        targets if the dwell of the beam is not known (`radar.integration_s` is None), or if the
+        record is shorter than 1.15 dwells. There are none in trials where the targets migrate out
+        of the swath in more than half of the range cells, or less than a tenth of the energy is
+        that of such targets. `doppler_hz` and infinity are then returned.
 
     """
     std = torch.full_like(doppler_hz, math.inf)
     if radar.integration_s is None:
         return doppler_hz, std
-    dwell = math.ceil(1.04 * radar.integration_s * radar.prf_hz)  # with a guard of 2 % at each end, by trial
+    # length of the dwell in lines, with a guard of 2 % at each end, by trial
+    dwell = math.ceil(1.04 * radar.integration_s * radar.prf_hz)
     if raw.shape[-2] < 1.1 * dwell:
         return doppler_hz, std
     raw, value = unit_level(raw), doppler_hz
@@ -68,7 +69,8 @@ def complete_aperture_centroid(
 def _refined(
     raw: Tensor, radar: StripmapRadar, doppler_hz: Tensor, dwell: int, reference: str | None
 ) -> tuple[Tensor, Tensor]:
-    """One round: form an image with centroid doppler_hz, then update lines and centroid in turn.
+    """Make one round: form an image with the centroid doppler_hz, then update the lines and the
+    centroid in turn.
 
     The image is formed in chunks of range that overlap by a pulse length, so that memory does not
     grow with the swath.
@@ -82,7 +84,7 @@ def _refined(
         parts.append(_tiles(raw[..., a : b + extra], near, doppler_hz, reference))
     products, power = (torch.cat([part[k] for part in parts], -1) for k in (0, 1))
     rate = torch.cat([torch.full(p.shape[-1:], r, dtype=torch.float64, device=raw.device) for p, _, r in parts])
-    # how far the coherence of a tile exceeds that of white noise, 0..1
+    # coherence of a tile, and a weight, 0 to 1, by how far it exceeds that of white noise
     coherence = products.abs() / or_one(power)
     weight = (1 - 6 / (_TILE[0] * _TILE[1] * coherence.square()).clamp_min(1e-9)).clamp_min(0)
     products = products * weight
@@ -90,27 +92,28 @@ def _refined(
     line = (torch.arange(products.shape[-2], dtype=torch.float64, device=raw.device) + 0.5) * tile
     total, whole, phase = doppler_hz, torch.ones_like(power), torch.zeros_like(doppler_hz)
     for _ in range(8):
-        # in a frame with an error d, targets appear late by d / rate
+        # if the Doppler of the frame has an error d, targets appear late by d / rate
         shift = (total - doppler_hz)[..., None, None] / rate * radar.prf_hz
         whole = _whole(line[:, None] - shift, raw.shape[-2], dwell)
         chosen = (products * whole).sum((-2, -1))
         phase = torch.angle(chosen)
         total = torch.where(chosen.abs() > 0, total + wrapped(scale * phase - total, radar.prf_hz), total)
     kept, energy = (products * whole).abs().sum((-2, -1)), products.abs().sum((-2, -1))
-    half_way = math.pi / 2 * parts[0][2] * dwell / radar.prf_hz**2  # rad, between centre and edge of the beam
+    # phase increment in rad half way between the centre and the edge of the beam
+    half_way = math.pi / 2 * parts[0][2] * dwell / radar.prf_hz**2
     noise = ((weight * whole).square() * _noise_variance(power, radar)).sum((-2, -1))
-    # of the energy of targets that are left out, half a percent leaks into the chosen tiles, with a
-    # Doppler half way to the edge of the beam
+    # Half a percent of the energy of targets that are left out leaks into the chosen tiles, with a
+    # Doppler half way to the edge of the beam.
     std = scale * _std_rad(products * whole, noise, phase, 0.005 * half_way * (energy - kept))
-    # what is less than a tenth of the energy may be nothing but the sidelobes of other targets
+    # less than a tenth of the energy may be nothing but sidelobes of other targets
     return total, torch.where(kept > 0.1 * energy, std, math.inf)
 
 
 def _whole(crossing: Tensor, lines: int, dwell: int) -> Tensor:
-    """Weight of image lines by the line at which the beam centre crosses their targets.
+    """Weight of image lines, given the line at which the beam centre crosses their targets.
 
     The weight is 1 where the whole dwell lies inside the record and 0 where it does not. It falls
-    off over a tenth of a dwell: a sharp end would cut responses that a wrong nominal velocity
+    off over a tenth of a dwell. A sharp end would cut responses that a wrong nominal velocity
     smears, and the parts of such a response differ in Doppler.
     """
     margin = torch.minimum(crossing - dwell / 2, lines - dwell / 2 - crossing)
@@ -131,7 +134,7 @@ def _tiles(
     inside = stays_inside(image.shape[-1], radar, doppler_hz, radar.integration_s or 0.0, always=False)
     image = image * inside[..., None, :].to(image.real.dtype)
     products, power = lag_products(image, tiles)
-    # lag_products is scale free, chunks must stay comparable
+    # the chunks are scaled alike, because `lag_products` removes the scale of its input
     scale = image.abs().amax((-2, -1)).to(torch.float64).square()[..., None, None]
     rate = radar.azimuth_rate_hz_s(radar.near_range_m + image.shape[-1] / 2 * radar.range_step_m)
     return products * scale, power * scale, float(rate)
@@ -156,9 +159,9 @@ def reference_spectrum(radar: StripmapRadar, reference: str | None, raw: Tensor)
 def _noise_variance(power: Tensor, radar: StripmapRadar) -> Tensor:
     """Variance that noise adds to the imaginary part of the products of a tile.
 
-    It includes noise times noise and noise times signal. The noise power is that of the tile at the
-    lowest tenth. Compression leaves noise in the band of the pulse only, so that neighbouring range
-    cells are alike.
+    It includes noise times noise and noise times signal. The noise power is the power that a tenth
+    of the tiles do not exceed. Compression leaves noise in the band of the pulse only, so that
+    neighbouring range cells are correlated.
     """
     flat = power.flatten(-2)
     floor = torch.where(flat > 0, flat, torch.inf).kthvalue(max(1, flat.shape[-1] // 10), dim=-1).values
@@ -168,12 +171,12 @@ def _noise_variance(power: Tensor, radar: StripmapRadar) -> Tensor:
 
 
 def _std_rad(products: Tensor, noise: Tensor, phase_rad: Tensor, leak: Tensor) -> Tensor:
-    """Standard deviation of the common phase: that of noise or of the scatter, the larger of both.
+    """Standard deviation of the common phase: the larger one of those by noise and by the scatter.
 
     The scatter has two parts, with weights found by trial. Columns of tiles are independent, but
     few of them may hold most of the energy. Twelfths of columns are many, but those of one target
-    may differ in Doppler, since a wrong nominal velocity smears it. `leak` is the imaginary part of
-    the products that may leak into the chosen tiles from targets that are cut.
+    may differ in Doppler, because a wrong nominal velocity smears it. `leak` is the imaginary part
+    of the products that may leak into the chosen tiles from targets whose dwell is cut.
     """
     parts = torch.stack([part.sum(-2) for part in products.tensor_split(12, -2)], -2) * cis(-phase_rad)[..., None, None]
     columns = parts.sum(-2)

@@ -188,7 +188,7 @@ def energy_centre(
     n = 2 * (max(last - first for first, last in bounds) // 2 + 1)
     spectra = [power_of(fft_lines(lines[..., first : last + 1, :], n=n)) for first, last in bounds]
     spectrum = torch.stack([power.to(torch.float64).sum(-1) for power in spectra]).sum(0)
-    # first Fourier coefficient
+    # phase of the first Fourier coefficient of the azimuth spectrum
     turn = 2 * math.pi / n * torch.arange(n, dtype=torch.float64, device=x.device)
     phase = torch.atan2((spectrum * torch.sin(turn)).sum(-1), (spectrum * torch.cos(turn)).sum(-1))
     value = {"doppler_baseband_hz": wrapped(prf_hz / (2 * math.pi) * phase, prf_hz)}
@@ -234,7 +234,7 @@ class _Baseband(Stage):
     """Base class of the stages that estimate the baseband Doppler centroid of lines."""
 
     provides = ("doppler_baseband_hz",)
-    # function of lines, PRF, blocks, rate and dwell
+    # function of lines, PRF, blocks, rate, dwell
     find: Callable[..., Estimate]
 
     def __init__(self, radar: StripmapRadar, blocks: tuple[int, int] = (8, 8), assess: bool = True) -> None:

@@ -1,9 +1,9 @@
-"""Whether a Doppler centroid can be trusted: its standard deviation, quality and outcome.
+"""Assessment of a Doppler centroid: its standard deviation, quality and outcome.
 
-Three questions are asked of the lines: Are adjacent lines coherent, so that there is anything but
-noise? Are the targets seen whole, or do the ends of the record cut so many apertures that the
-centroid is that of the cut ones? How far do the range blocks scatter? Of a centroid that is not
-ambiguous it is also asked whether another multiple of the PRF explains the data as well.
+Three questions are asked of the lines. Are adjacent lines coherent, so that there is anything but
+noise? Are the dwells of the targets complete, or do the ends of the record cut so many that the
+centroid is that of the cut ones? How far do the range blocks scatter? Of an absolute centroid it is
+also asked whether another multiple of the PRF explains the data as well.
 """
 
 from __future__ import annotations
@@ -19,15 +19,16 @@ from torchsar.compensate.pulse_phase.data import or_one
 from torchsar.core import Estimate, Outcome, cis, power_of, unit_level, worst
 from torchsar.metrics.bounds import tone_frequency_bound_hz
 
-# Largest standard deviation of an estimate that is ok, in PRF. Noise alone has a predicted standard
-# deviation about ten times as large, since the sum of its products is no larger than their scatter.
+# Largest standard deviation of a good estimate in units of the PRF. That predicted for noise is
+# about ten times as large, because the sum of the products of noise is no larger than their
+# scatter.
 MOST_STD = 0.015
-# probability that the ambiguity of the PRF is right, above which it is taken as known, by choice
+# least probability of the ambiguity of the PRF with which it counts as known, by choice
 LEAST_PROBABILITY = 0.9
 
 
 class Increments(NamedTuple):
-    """What the error of the phase increment between adjacent lines depends on.
+    """Quantities that determine the error of the phase increment between adjacent lines.
 
     Args:
         products: Sums of the products of adjacent lines over blocks, shape (..., a, b), complex128.
@@ -40,11 +41,12 @@ class Increments(NamedTuple):
             up to more than in noise, shape (...,).
         scale: Frequency of a phase increment of 1 rad, in Hz.
 
-    A target whose aperture is cut by an end of the record shows only a part of its band. For
-    targets of even density on both sides of the end, which cross a beam of constant gain in N lines
-    with phase increments up to b rad from the centroid, the imaginary part of the products of
-    adjacent lines, turned by the centroid and summed over the record, is (1 - b cot b) N / (2 b)
-    times the real part of one pair of lines at the last line, and minus this at the first line.
+    A target whose aperture is cut by an end of the record shows only a part of its band. Consider
+    targets of even density on both sides of the end, which cross a beam of constant gain in N
+    lines. Their phase increments differ by up to b rad from the centroid. The products of adjacent
+    lines are turned by the centroid and summed over the record. Their imaginary part is then (1 - b
+    cot b) N / (2 b) times the real part of one pair of lines at the last line, and minus this at
+    the first line.
     """
 
     products: Tensor
@@ -71,7 +73,7 @@ class Increments(NamedTuple):
                 the band is measured from the products of lines two apart: cos b over their ratio.
         """
         x = unit_level(x)
-        x = x / or_one(x.abs().amax((-2, -1), keepdim=True))  # as in the products
+        x = x / or_one(x.abs().amax((-2, -1), keepdim=True))  # scaled as in `lag_products`
         step = torch.linalg.vecdot(x[..., :-1, :], x[..., 1:, :]).to(torch.complex128)
         coherent = _adds_up(step) | _adds_up(step[..., :-1].conj() * step[..., 1:])
         pairs = x.shape[-2] - 1
@@ -84,20 +86,21 @@ class Increments(NamedTuple):
             half_band = torch.full_like(step[..., 0].real, math.pi * rate_hz_s * dwell_s / prf_hz)
         half_band = half_band.clamp(1e-3, 0.95 * math.pi)
         dwell = pairs / 2 if rate_hz_s is None else half_band * prf_hz**2 / (math.pi * rate_hz_s)
-        last = max(1, pairs // (2 * products.shape[-2]))  # half of a block
+        last = max(1, pairs // (2 * products.shape[-2]))  # half of the lines of a block
         parts = (-1, x[..., : last + 1, :]), (1, x[..., -last - 1 :, :])
         mean = [sign * (part[..., :-1, :].conj() * part[..., 1:, :]).sum(-2) / last for sign, part in parts]
         ends = torch.stack(mean, -2).to(torch.complex128).tensor_split(products.shape[-1], -1)
-        lines = (1 - half_band / torch.tan(half_band)) * dwell / (2 * half_band)  # about half_band * dwell / 6
+        # for a narrow band about half_band * dwell / 6
+        lines = (1 - half_band / torch.tan(half_band)) * dwell / (2 * half_band)
         ends = torch.stack([some.sum(-1) for some in ends], -1) * lines[..., None, None]
         return Increments(products, power, half_band, ends, coherent, prf_hz / (2 * math.pi))
 
 
 def _adds_up(products: Tensor) -> Tensor:
-    """Whether products (..., n) add up to more than products of random phases.
+    """True where products (..., n) add up to more than products of random phases.
 
-    The power of their sum over the sum of their powers is exponentially distributed with mean 1 in
-    noise; more than 9 then occurs once in 8000 records.
+    In noise, the power of their sum over the sum of their powers is exponentially distributed with
+    mean 1. More than 9 then occurs once in 8000 records.
     """
     return products.sum(-1).abs().square() > 9.0 * products.abs().square().sum(-1)
 
@@ -122,21 +125,23 @@ def baseband(found: Estimate, lines: Increments) -> Estimate:
     blocks = lines.products.sum(-2) * turn[..., None] / total
     terms = blocks.imag - cuts.sum(-2)
     if terms.shape[-1] >= 4:
-        # range walk, and the change of Doppler along a pulse, add to a block and take from the next
+        # range walk, and the change of Doppler along a pulse, add to one block what they take from
+        # the next
         power = blocks.real.clamp_min(0)
         along = torch.nn.functional.pad((power[..., 1:] * power[..., :-1]).sqrt(), (1, 1)).diff(dim=-1)
         slope = (terms * along).sum(-1, keepdim=True) / or_one(along.square().sum(-1, keepdim=True))
         terms = (terms - slope * along) * math.sqrt(terms.shape[-1] / (terms.shape[-1] - 2))
-    # Where few blocks hold most of the energy, few targets are cut, which are not of even density:
-    # for a beam of constant gain, the first moment of a cut target scatters by sqrt(1/5).
+    # If few blocks hold most of the energy, few targets are cut by the ends of the record, and
+    # their density is not even. For a beam of constant gain, the first moment of a cut target
+    # scatters by sqrt(1/5).
     share = blocks.real.clamp(0, 1).square().sum(-1)
     scatter = (terms.square() + (0.45 * share[..., None] * cuts.sum(-2)).square()).sum(-1).sqrt().clamp_max(math.pi)
     scatter, shift = torch.where(some, scatter, math.pi), cuts.sum((-2, -1)).clamp(-1, 1)
     power = lines.power.sum((-2, -1))
     along = (lines.products.sum(-1) * cis(-phase)[..., None]).real.clamp_min(0)
     extent = along.sum(-1).square() / or_one(along.square().sum(-1)) / along.shape[-1]
-    # targets seen for less of the record are cut by its end, or nearly as short as their own drift
-    # of Doppler
+    # Targets that are illuminated for a smaller part of the record are cut by its end, or are
+    # nearly as short in time as the drift of their Doppler.
     short = (extent < 0.3) & (along.shape[-1] >= 4)
     return replace(
         found,
@@ -179,7 +184,8 @@ def absolute(
         (Outcome.INEXACT, ~lines.coherent | inexact),
         (Outcome.MISFIT, shift >= lines.scale * lines.half_band_rad / 4),
         (Outcome.AMBIGUOUS, probability <= LEAST_PROBABILITY),
-        # incoherent lines with a third of the deviation of random frequencies, by choice
+        # lines are incoherent, and the deviation is at least a third of that of random frequencies,
+        # by choice
         (Outcome.NOISE, ~lines.coherent & (std >= 0.1 * unit)),
         (Outcome.EMPTY, plain.outcome == Outcome.EMPTY),
     )
@@ -218,24 +224,24 @@ def of_point(
     """
     power, (tone, phasor), (line, sample) = power_of(image), history, at
     ordered, n = power.flatten(-2), power.shape[-2]
-    # The power of noise has an exponential distribution, with the mean median / ln 2: 99 of 100
-    # samples do not exceed the median by more than mean * ln 50. In noise with a longer tail, such
-    # as that of real samples, they do.
+    # The power of noise has an exponential distribution, with the mean median / ln 2. In 99 of 100
+    # samples it exceeds the median by no more than mean * ln 50. In noise with a longer tail, such
+    # as that of real samples, it exceeds that.
     median, count = ordered.median(-1).values.double(), ordered.shape[-1]
     floor, highest = median / math.log(2), math.log(count) + 10
     tail = (ordered.kthvalue(count - count // 100, -1).values.double() - median) / math.log(50)
-    # Four resolution cells to each side belong to the response of a point. Among equal points or
-    # speckle nothing shows which point the beam centre crosses at the given time: no other one may
-    # have more than a quarter of the power, beyond the peaks of noise.
+    # Four resolution cells to each side belong to the response of a point. Among equal points or in
+    # speckle, it is not known which point the beam centre crosses at the given time. Therefore no
+    # other one may have more than a quarter of the power, beyond the peaks of noise.
     off = (torch.arange(n, device=power.device) - line[..., None]).abs()
-    rows = torch.minimum(off, n - off) <= 4 * cell[0][..., None]  # circular in azimuth
+    rows = torch.minimum(off, n - off) <= 4 * cell[0][..., None]  # the image is circular in azimuth
     columns = (torch.arange(power.shape[-1], device=power.device) - sample[..., None]).abs() <= 4 * cell[1]
     rival = power.masked_fill(rows[..., :, None] & columns[..., None, :], 0).amax((-2, -1)).double()
-    # The peak is the highest of many samples with noise of the whole PRF; the sum of the history
-    # has that of its own band. Noise alone gives it a power of 1.
+    # The peak is the highest of many samples with noise of the whole PRF. The sum of the history
+    # has only the noise of its own band. Noise alone gives it a power of 1.
     peak, total = ordered.amax(-1).double(), (tone * phasor.conj()).sum(-1).abs().square()
     q = (total / ((tone != 0).sum(-1).clamp_min(1) * or_one(floor)) - 1).clamp_min(0)
-    # without noise, the interpolation of the response leaves 2.5e-4 cycles per dwell
+    # without noise, the error of the interpolation of the response is 2.5e-4 cycles per dwell
     std = torch.hypot(tone_frequency_bound_hz(q.clamp_min(1e-12), visible_s), q.new_tensor(2.5e-4 / visible_s))
     outcome = worst(
         (Outcome.AMBIGUOUS, peak <= 4.0 * (rival - highest * floor)),

@@ -1,9 +1,9 @@
-"""Whether range shifts of envelopes can be trusted: their deviation from two halves of the band.
+"""Assessment of range shifts of envelopes: their standard deviation from two halves of the band.
 
 The speckle and the noise of the lower and the upper half of the band are independent. A half has
-cells twice as wide and half as many of them, so that the mean of both errs twice as much as the
-whole band, and their difference four to six times as much. Shifts of single pulses that are not the
-likeliest ones also err by their distance from these.
+cells twice as wide, and half as many of them. The mean of both shifts therefore has twice the error
+of the whole band, and their difference four to six times as much. Shifts of single pulses that are
+not the likeliest ones also have an error by their distance from these.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torch import Tensor
 from torchsar.compensate.envelope_fit import Course, Envelopes, robust_std, single_shifts
 from torchsar.core import Estimate, Outcome, worst, wrapped
 
-# standard deviation of a shift in cells from which on an alignment is not ok: a convention
+# standard deviation of a shift in cells from which an alignment is inexact, a convention
 GOOD_CELLS = 0.5
 _LEAST_RANGE_CELLS = 4
 
@@ -48,20 +48,21 @@ def deviation(
     lower, upper = (find(Envelopes.of(end))[0] * (n / half) for end in ends)
     phasor = torch.where(present, torch.polar(torch.ones_like(lower), 2 * math.pi / n * (lower - upper)), 0)
     apart = wrapped(lower - upper - torch.angle(phasor.sum(-1, keepdim=True)) * (n / (2 * math.pi)), n)
-    # over the error of the whole band it is 4 by the number and the width of the cells, 4.5 to 6.5
-    # in speckle and among points
+    # The ratio to the error of the whole band is 4 by the number and the width of the cells. It was
+    # 4.5 to 6.5 in speckle and among points.
     apart = torch.where(present, apart, 0) / 5.0
     count = (present.sum(-1) - 1).clamp_min(1)
     if std is not None:
         agree = (apart.square().sum(-1) / count).sqrt() < GOOD_CELLS
         return std, agree & (std < GOOD_CELLS / 2)
-    # a pulse whose halves differ by far is aligned at a wrong maximum by one of them
+    # if the halves of a pulse differ by far more, one of them was aligned at a wrong maximum
     usual = 4.0 * robust_std(apart.abs(), present)
     agree = (apart.abs() > usual).sum(-1) <= 0.05 * count
     envelopes = Envelopes.of(lines)
     likeliest = single_shifts(envelopes, single_shifts(envelopes, shift, "likelihood", 3), "refined", 2)
     terms = torch.minimum(apart.abs(), usual).square() + torch.where(present, wrapped(likeliest - shift, n), 0).square()
-    # without noise, the parabola through samples a quarter of a cell apart errs by 1e-3 cells
+    # without noise, the parabola through samples a quarter of a cell apart has an error of 1e-3
+    # cells
     return (terms.sum(-1) / count + 1e-6).sqrt(), agree
 
 
@@ -83,8 +84,8 @@ def assessed(found: Estimate, std: Tensor, agree: Tensor, cells: int) -> Estimat
         (Outcome.INEXACT, std >= GOOD_CELLS),
         (Outcome.PARTS_DISAGREE, ~agree),
         (Outcome.TOO_FEW, (count < 2) | (cells < _LEAST_RANGE_CELLS)),
-        # polynomials in noise have 0.6 of the deviation of random positions in the window, single
-        # pulses by half of the band 0.28
+        # In noise, polynomials have 0.6 of the standard deviation of random positions in the
+        # window. Single pulses have 0.28, from the halves of the band.
         (Outcome.NOISE, (std > 0.15 * random) & (count >= 2) & (cells >= _LEAST_RANGE_CELLS)),
         (Outcome.EMPTY, count == 0),
     )

@@ -15,12 +15,12 @@ from torch import Tensor
 from torchsar.core import legendre, linear_phasor, linear_solve, unit_level, wrapped
 from torchsar.optim.scalar import vertex
 
-_HALF = 2  # samples per cell: |s|^2 has twice the band of s
-_QUARTER = 4  # samples per cell in correlations, whose other factor is not band-limited
-# least power of a cell in the likelihood, over the mean power: empty cells must not dominate
+_HALF = 2  # samples per range cell, because |s|^2 has twice the band of s
+_QUARTER = 4  # samples per range cell in correlations, whose other factor is not band-limited
+# least power of a cell in the likelihood, over the mean power, so that empty cells do not dominate
 _FLOOR = 1e-2
-# power of a tone in the mean powers of a periodogram, beyond the log of its number of cells: one
-# false tone in 400 trials (exp(-6) = 1 / 403)
+# Least power of a tone in a periodogram, in units of its mean power, minus the logarithm of the
+# number of cells. It gives one false tone in 400 trials (exp(-6) = 1 / 403).
 _STANDS_OUT = 6.0
 
 
@@ -57,7 +57,7 @@ class Envelopes:
             The envelopes.
         """
         n = lines.shape[-1]
-        # band-limited interpolation; all n frequencies are kept, from -(n // 2) on
+        # band-limited interpolation that keeps all n frequencies, from -(n // 2) on
         spectrum = torch.fft.fftshift(torch.fft.fft(unit_level(lines, 1)), dim=-1)
         before = _HALF * n // 2 - n // 2
         padded = torch.nn.functional.pad(spectrum, (before, (_HALF - 1) * n - before))
@@ -116,7 +116,8 @@ class Envelopes:
             at = torch.arange(samples, dtype=power.dtype, device=power.device) * (self.n / samples)
             # upper limit of the power of a sinc pulse in a circular window
             limit = (samples / self.n) * (self.n * torch.sin(math.pi * at / self.n)).square()
-            # beyond 1.5 cells and times 1.5, for 1 to 200 points
+            # sidelobes are considered beyond 1.5 cells and with 1.5 times this power, which suits 1
+            # to 200 points
             far = torch.minimum(at, self.n - at) >= 1.5
             kernel = torch.where(far, 1.5 / torch.where(far, limit, 1), 0)
             level = torch.fft.irfft(torch.fft.rfft(power) * torch.fft.rfft(kernel), samples)
@@ -136,7 +137,7 @@ class Envelopes:
         Returns:
             The position in cells, -n/2..n/2 for n range cells, shape (...,), float64.
         """
-        # the mean does not affect the maximum; without it, rounding errors are smaller
+        # the mean does not affect the maximum, and without it rounding errors are smaller
         samples = self.on_grid(torch.cat([torch.zeros_like(spectra[..., :1]), spectra[..., 1:]], -1), _QUARTER)
         length = samples.shape[-1]
         outside = wrapped(torch.arange(length, device=samples.device) / _QUARTER, self.n).abs() > within
@@ -147,7 +148,8 @@ class Envelopes:
         return torch.where(position > length / 2, position - length, position) / _QUARTER
 
 
-# shifts (trial, pulse), and their standard deviation (trial,) if the method predicts one
+# shifts (trial, pulse), and their standard deviation (trial,), or None if the method does not
+# predict it
 Course = tuple[Tensor, Tensor | None]
 
 
@@ -180,8 +182,8 @@ def running_shifts(pulses: Envelopes, gain: float) -> Tensor:
 def single_shifts(pulses: Envelopes, start: Tensor, match: str, iterations: int) -> Tensor:
     """Find the shift of each pulse separately against the mean envelope of all aligned pulses.
 
-    Sidelobes help to tell the maxima of the likelihood apart, but they depend on each other over
-    many cells, and without them the shift of a pulse errs less where noise is weak.
+    Sidelobes help to distinguish the maxima of the likelihood, but they are correlated over many
+    cells. Without them the error of a shift is smaller where noise is weak.
 
     Args:
         pulses: Envelopes.
@@ -225,7 +227,7 @@ def smooth_shifts(pulses: Envelopes, degree: int, passes: int, blocks: int) -> t
     """
     k = pulses.present.shape[-1]
     basis = legendre(unit_time(k, pulses.present.device), degree)
-    # 1 where a present pulse belongs to a block of equal length, (trial, block, pulse)
+    # elements are 1 where a present pulse belongs to a block of equal length, (trial, block, pulse)
     length = -(-k // max(blocks, degree + 1))
     run, block = (torch.arange(n, device=basis.device) for n in (k, -(-k // length)))
     runs = ((run // length == block[:, None]) & pulses.present[:, None]).to(torch.float64)
@@ -234,7 +236,8 @@ def smooth_shifts(pulses: Envelopes, degree: int, passes: int, blocks: int) -> t
     middle = (runs @ basis) / count.clamp_min(1)[..., None]
     for _ in range(passes):
         sums = runs.to(pulses.spectra.dtype) @ pulses.moved(shift)
-        # a block is compared with the others alone: its own noise would keep its present shift
+        # a block is compared with the other blocks only, because its own noise would keep its
+        # present shift
         others = (sums.sum(-2, keepdim=True) - sums) / (count.sum(-1, keepdim=True) - count).clamp_min(1)[..., None]
         found = pulses.peak(sums * pulses.likelihood(others).conj())
         step = robust_fit(found, middle, count)
@@ -257,8 +260,8 @@ def mean_drift(pulses: Envelopes) -> Tensor:
     Returns:
         The drift in cells per pulse, modulo the window, shape (trial,), float64.
     """
-    # finer features agree only close to the right drift, coarser ones measure it
-    # less well
+    # Features finer than the 16 lowest frequencies agree only close to the true drift, coarser ones
+    # measure it less well.
     k, last = pulses.present.shape[-1], min(16, pulses.n - 1)
     if last < 1:
         return torch.zeros(len(pulses.present), dtype=torch.float64, device=pulses.present.device)
@@ -296,7 +299,8 @@ def robust_fit(values: Tensor, basis: Tensor, weight: Tensor, iterations: int = 
         if iteration < iterations // 2:
             now = weight / residual.clamp_min(0.1)
         else:
-            # far below any jitter; the usual constant gives 95 % efficiency for normal errors
+            # The constant is far below any jitter. The usual factor of 4.685 gives 95 % efficiency
+            # for normal errors.
             scale = 4.685 * (robust_std(residual, weight > 0) + 1e-3)
             now = weight * (1 - (residual / scale).square()).clamp_min(0).square()
     return coefficients
@@ -338,7 +342,7 @@ def with_tones(pulses: Envelopes, smooth: Tensor, tones: int, degree: int) -> Te
         return single_shifts(pulses, course, "likelihood", 1) - course
 
     for _ in range(tones):
-        # fitted together with the polynomial
+        # the tone is fitted together with the polynomial
         frequency, stands_out = strongest_tone(rest(course), pulses.present)
         parts, base, now = torch.zeros_like(terms[:, 0, :1]).expand(-1, 2), course, course
         for _ in range(5):  # Gauss-Newton steps
@@ -351,7 +355,7 @@ def with_tones(pulses: Envelopes, smooth: Tensor, tones: int, degree: int) -> Te
             base = base + (terms @ step[:, :-3, None]).squeeze(-1)
             now = base + (_waves(frequency, time) @ parts[..., None]).squeeze(-1)
         gain = log_likelihood(pulses, now) - log_likelihood(pulses, course)
-        # the removal of a tone of 0.05 cell costs as much as it gains
+        # removing a tone of 0.05 cells adds as much error as it takes away
         kept = stands_out & (parts.square().sum(-1).sqrt() > 0.05) & (gain > math.log(k) + _STANDS_OUT)
         course = centred(torch.where(kept[:, None], now, course), torch.ones_like(pulses.present))
     return course
@@ -394,7 +398,7 @@ def strongest_tone(rest: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
     k = rest.shape[-1]
     limit = 3 * rest.abs().median(-1, keepdim=True).values
     power = torch.fft.rfft(torch.where(present, rest.clamp(-limit, limit), 0), 8 * k).abs().square()
-    power[:, :8] = 0  # less than one period in the aperture is left to the polynomial
+    power[:, :8] = 0  # less than one period in the aperture is described by the polynomial
     top, at = power.max(-1)
     return at / (8 * k), top > (math.log(k) + _STANDS_OUT) * power.mean(-1)
 

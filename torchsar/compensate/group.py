@@ -201,9 +201,10 @@ def aperture_lines(raw: Tensor, radar: StripmapRadar, spectrum: Tensor | None) -
         spectrum: Range reference spectrum, see `compress`.
 
     Returns:
-        Range-compressed lines of unit level, shape (..., pulse, column), complex; and the time in
-        seconds for which the beam illuminates a target in the middle of the swath: the nominal
-        dwell, or without one that in which its Doppler frequency changes by one PRF.
+        Range-compressed lines of unit level, shape (..., pulse, column), complex. And the time in
+        seconds for which the beam illuminates a target in the middle of the swath. It is the
+        nominal dwell or, if there is none, the time in which the Doppler frequency of the target
+        changes by one PRF.
     """
     dwell = radar.aperture_s(radar.near_range_m + raw.shape[-1] / 2 * radar.range_step_m)
     most = max(1024, round(4 * dwell * radar.prf_hz))
@@ -280,7 +281,9 @@ def block_weights(columns: Tensor, radar: StripmapRadar, doppler_hz: Tensor, dwe
 
 
 def _block_count(width: int) -> int:
-    """Number of blocks of 32 columns, wide enough for the range walk by a wrong velocity."""
+    """Number of blocks of 32 columns, which are wide enough for the range walk by a wrong
+    velocity.
+    """
     return max(1, width // 32)
 
 

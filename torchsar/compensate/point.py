@@ -132,7 +132,7 @@ def point_history(
     n = image.shape[-2]
     columns = image.shape[-1]
     weights = torch.sinc(torch.arange(columns, dtype=torch.float64, device=image.device) - sample[..., None])
-    # of a point beside the image, side lobes and rounding would be all of the history
+    # for a point beside the image, the history would consist of side lobes and rounding errors
     weights = weights * ((sample > -1) & (sample < columns))[..., None]
     column = (image * weights[..., None, :].to(image.real.dtype)).sum(-1).to(torch.complex128)
     spectrum = torch.fft.fft(column)
@@ -143,7 +143,7 @@ def point_history(
     history = torch.fft.ifft(spectrum * cis(math.pi * offset.square() / rate))
     lines = (
         torch.round(start_s[..., None] * prf_hz) - n // 2 + torch.arange(n, dtype=torch.float64, device=image.device)
-    )  # the peak is in the middle
+    )  # the peak of the response is in the middle
     since = lines / prf_hz - start_s[..., None]
     tone = (
         history.gather(-1, torch.remainder(lines, n).long())
@@ -236,7 +236,7 @@ class PointDoppler(Stage):
         position, cos = response["position_range_m"], torch.sqrt(1 - radar.sin_squint(frame, velocity).square())
         rate = (
             radar.azimuth_rate_hz_s(position, velocity) * cos.square()
-        )  # of a point at this slant range in the direction of the frame
+        )  # Doppler of a point at this slant range in the direction of the frame
         crossing, record = (
             (azimuth.n // 2) / radar.prf_hz
             if self.crossing_s is None

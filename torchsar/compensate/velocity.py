@@ -1,7 +1,7 @@
 """Effective velocity by minimum entropy of a small group of range cells (Tsvetkov 2017).
 
 The group is always focused from the original data: its two-dimensional spectrum is formed once and
-focused anew for every velocity. The objective is the mean entropy of blocks of range cells, each
+focused again for every velocity. The objective is the mean entropy of blocks of range cells, each
 block taken separately, so that a few very bright ships do not dominate.
 """
 
@@ -63,7 +63,9 @@ def velocity_objective(group: RangeGroup, doppler_hz: Tensor, dwell_s: float) ->
 
 
 def _nominal(group: RangeGroup, doppler_hz: Tensor, dwell_s: float) -> tuple[BeamSpectrum, Tensor, Tensor]:
-    """Spectrum of a group, its image of the nominal velocity, weights of blocks (..., block)."""
+    """Spectrum of a group, its image for the nominal velocity, and weights of its blocks (...,
+    block).
+    """
     spectrum, radar = beam_spectrum(replace(group, data=unit_level(group.data)), doppler_hz), group.radar
     with torch.no_grad():
         image = spectrum.image(doppler_hz, radar.velocity_m_s)
@@ -80,13 +82,14 @@ def _objective(spectrum: BeamSpectrum, doppler_hz: Tensor, weight: Tensor) -> Ca
 
 
 def _parts(spectrum: BeamSpectrum, doppler_hz: Tensor, weight: Tensor, velocity_m_s: Tensor) -> tuple[Tensor, ...]:
-    """Range-Doppler spectrum (..., row, range) of the image of a velocity (...,), and what its
-    parts add to the entropies of the blocks, and to the shares of the energy, (..., block, part)
-    each, times the weights of the blocks.
+    """Range-Doppler spectrum (..., row, range) of the image for a velocity (...,), and weighted
+    contributions of eight parts along azimuth.
 
-    The image has twice as many azimuth samples as the spectrum has rows. The entropy of an image of
-    one sample per resolution cell changes with the place of a target between two samples, and a
-    wrong velocity moves targets. For the standard deviation, it has eight parts along azimuth.
+    The second result is the contribution of each part to the entropies of the blocks, and the third
+    that to the shares of the energy, (..., block, part) each. Both are multiplied by the weights of
+    the blocks. The image has twice as many azimuth samples as the spectrum has rows. With one
+    sample per resolution cell, the entropy would change with the position of a target between two
+    samples, and a wrong velocity moves targets. The parts serve to find the standard deviation.
     """
     rows = spectrum.rows(doppler_hz, velocity_m_s)
     entropy, share = entropy_parts(fft_lines(rows, inverse=True, n=2 * rows.shape[-2]), 8)
@@ -181,10 +184,11 @@ def minimum_entropy_velocity(
         parts = [_parts(spectrum, doppler_hz, weight, value + side * half) for side in (-1, 0, 1)]
         rows, (low, middle, high), shares = zip(*parts, strict=True)
         curvature = (low - 2 * middle + high).sum((-2, -1)) / half**2
-        # without the energy that moves from one part to another, which changes no entropy by itself
+        # energy that moves from one part to another, which does not change the entropy by itself,
+        # is left out
         level = middle.sum(-1, keepdim=True) / shares[1].sum(-1, keepdim=True).clamp_min(1e-300)
         slope = (high - low - level * (shares[2] - shares[0])) / (2 * half)
-        # the step to the vertex of the parabola, at most to its ends
+        # the step leads to the vertex of the parabola, and at most to its ends
         value = value - quotient(slope.sum((-2, -1)), curvature).clamp(-half, half)
         points = nominal + torch.linspace(-reach, reach, costs.shape[-1], dtype=torch.float64, device=start.device)
         found = Estimate({"velocity_m_s": value}, info={"grid_velocity_m_s": points, "grid_entropy": costs})
@@ -203,7 +207,8 @@ def _search(
     reach: float,
     full_step: float,
 ) -> tuple[Tensor, float, Tensor, Tensor]:
-    """Search the whole band; first its middle, with few and wide steps, where it has many.
+    """Search with the whole Doppler band, and before that with its middle, for which fewer and
+    wider steps suffice.
 
     Args:
         spectrum: Spectrum of the group.
@@ -216,8 +221,8 @@ def _search(
 
     Returns:
         The vertex of the parabola through the best velocity and its neighbours, or the best
-        velocity where it has only one neighbour, (...,); the half width about it for its
-        refinement; whether the best velocity of the first grid is not at an end, (...,); and the
+        velocity where it has only one neighbour, (...,). The half width about it for its
+        refinement. True where the best velocity of the first grid is not at an end, (...,). And the
         entropies of the first grid, (..., grid).
     """
     share, value, first, rows = min(1.0, math.sqrt(16 * full_step / reach)), start, None, spectrum.data.shape[-2]
@@ -307,7 +312,9 @@ class EffectiveVelocity(Stage):
         return pick_group(lines, focuser.radar, self.lines), dwell
 
     def _doppler(self, raw: Tensor, doppler_hz: Tensor | None) -> Tensor:
-        """The given Doppler centroid, or that of the pointing, shape (...,)."""
+        """Doppler centroid in Hz, shape (...,): the given one, or otherwise that of the pointing of
+        the antenna.
+        """
         pointing = self._focuser[0].radar.pointing_doppler_hz or 0.0
         given = torch.as_tensor(pointing if doppler_hz is None else doppler_hz, dtype=torch.float64, device=raw.device)
         return given.detach().expand(raw.shape[:-2])
@@ -324,15 +331,15 @@ class EffectiveVelocity(Stage):
             `velocity_m_s` of shape (...,) in m/s. `info` holds "grid_velocity_m_s", the velocities
             of the first grid search, shape (grid,); "grid_entropy", their entropies in nats, shape
             (..., grid); and "group_start", the first range sample of the group of range cells used,
-            shape (...,).
-            The assessment adds a standard deviation, and a quality that falls exponentially with
-            it, to 1/e where an eighth of a cycle of phase remains at the ends of the aperture (an
-            eighth of `grid_step_m_s`; where the dwell of the beam is not known, of the step that
-            belongs to the width of the minimum). The outcome is EMPTY or NOISE where no minimum is
-            deep enough for a focused image, as with clutter that fills the Doppler band evenly;
-            OUTSIDE_SEARCH where the entropy is least at an end of the searched interval; MISFIT
-            where the record is shorter than the dwell of the beam, so that every target is cut; and
-            INEXACT where the standard deviation exceeds that eighth.
+            shape (...,). The assessment adds a standard deviation, and a quality that falls
+            exponentially with it. The quality is 1/e where an eighth of a cycle of phase remains at
+            the ends of the aperture. This is an eighth of `grid_step_m_s` or, where the dwell of
+            the beam is not known, of the step that belongs to the width of the minimum. The outcome
+            is EMPTY or NOISE where no minimum is deep enough for a focused image, as with clutter
+            that fills the Doppler band evenly; OUTSIDE_SEARCH where the entropy is least at an end
+            of the searched interval; MISFIT where the record is shorter than the dwell of the beam,
+            so that every target is cut; and INEXACT where the standard deviation exceeds that
+            eighth.
         """
         (group, dwell), doppler = self.group(signal.data.detach()), self._doppler(signal.data, doppler_hz)
         found = minimum_entropy_velocity(group, doppler, dwell, self.reach_m_s, self.tolerance_m_s, assess=self.assess)

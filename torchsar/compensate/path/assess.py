@@ -1,7 +1,7 @@
-"""Whether errors of a path can be trusted: their standard deviation, quality and outcome.
+"""Assessment of errors of a path: their standard deviation, quality and outcome.
 
-Is the image sharper than noise can be made? Do several starts agree, and has the last round
-settled? Is the standard deviation small enough for a focused image?
+Is the image sharper than noise can be made? Do several starts agree, and have the phases hardly
+changed in the last round? Is the standard deviation small enough for a focused image?
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ LEAST_STREHL, _SPREAD = 0.8, 1.5
 # _UNFIT: residual power allowed without noise, as a share of the power. It was up to 0.2 % in
 # correct fits at 40 dB.
 RESTLESS, _WORSE, _UNFIT = 0.1, 1.5, 0.003
-# fewest scatterers of a strip, and least share of the pulses that see one, by choice
+# least number of scatterers of a strip, and least share of the pulses that see one, by choice
 LEAST_SCATTERERS, _LEAST_SEEN = 3, 0.95
 
 
@@ -47,12 +47,13 @@ def strehl(square_m2: Tensor, fringe_m: float, spread: float = 1.0) -> Tensor:
 def of_path(found: Estimate, starts: Starts, search: Search) -> Estimate:
     """Assess the errors of a path; see `path_autofocus`.
 
-    The standard deviation contains a part of the difference from another start, of the nearest of
-    those that explain the samples as well if there are any. All have the errors by noise in common;
-    what differs comes from the search. The errors of each are taken to be in proportion to what it
-    leaves of the samples: half the power of the difference comes from one that is as good, little
-    from one that is lost. The doubt takes half the power in any case: a wrong motion can explain
-    the samples as well as the true one, with more scatterers.
+    The standard deviation contains a part of the difference from the result of another start. It is
+    the nearest of those that explain the samples as well, if there are any. The errors by noise are
+    common to all results, so that a difference comes from the search. The error of each result is
+    assumed to be in proportion to its residual. If another result is as good, half the power of the
+    difference therefore counts; if it is much worse, little of it counts. The doubt contains half
+    the power in any case, because a wrong motion with more scatterers can explain the samples as
+    well as the true one.
 
     Args:
         found: The estimate.
@@ -72,7 +73,8 @@ def of_path(found: Estimate, starts: Starts, search: Search) -> Estimate:
         (Outcome.INEXACT, strehl(doubt, search.fringe_m, _SPREAD) <= LEAST_STREHL),
         (Outcome.AMBIGUOUS, best.noise > most),
         (Outcome.NOT_CONVERGED, best.restless > RESTLESS),
-        # more than for the phases of pulses, 1.5, because envelopes and three axes are free too
+        # the factor is larger than the 1.5 for phases of pulses, because envelopes and three axes
+        # are free too
         (Outcome.NOISE, sharp <= 2.0 * noise),
     )
     quality = strehl(doubt, search.fringe_m) * (1 - (noise / sharp.clamp_min(1e-12)).clamp(0, 1))

@@ -1,4 +1,5 @@
-"""Whole half wavelengths of the line of sight: fringes, which the phases of pulses leave open.
+"""Whole half wavelengths of the line of sight (fringes), which the phases of pulses do not
+determine.
 
 They follow from the smoothness of the motion, and from the envelopes of the pulses.
 """
@@ -21,7 +22,7 @@ from torchsar.radar.spotlight import frequency_samples, range_profiles
 
 
 def roughness(carrier_m: Tensor, fringe_m: float) -> Tensor:
-    """Measure the bends of the line of sight from pulse to pulse, as far as phases show them.
+    """Measure the second differences of the line of sight over the pulses, modulo a fringe.
 
     Args:
         carrier_m: Line of sight in metres, known modulo fringes, shape (..., pulse).
@@ -64,8 +65,9 @@ def smooth_near(
 
     The Viterbi algorithm minimises the sum of the squared differences from the measurement and of
     the squared second differences, each over its variance. A measurement of one pulse may be wrong
-    by any amount: fringes are sought about the median of what it and its neighbours add to the line
-    of sight that was known before, and a difference counts by at most three standard deviations.
+    by any amount. Fringes are therefore sought around a median: that of the differences of the
+    measurement from the previous line of sight, over the pulse and its neighbours. A difference
+    counts by at most three standard deviations.
 
     Args:
         carrier_m: Line of sight in metres, known modulo fringes, shape (trial, pulse).
@@ -84,7 +86,8 @@ def smooth_near(
     places = (carrier_m + fringe_m * torch.round((about - carrier_m) / fringe_m))[..., None] + n
     far = ((places - near_m[..., None]) / near_std_m).square().clamp_max(3.0**2)
     weight = bend_std_m.clamp_min(1e-3 * fringe_m)[:, None, None, None].square().reciprocal()
-    cost, back = far[:, 0, :, None] + far[:, 1, None, :], []  # (trial, last but one, last)
+    # cost of the states (trial, last but one, last)
+    cost, back = far[:, 0, :, None] + far[:, 1, None, :], []
     for p in range(2, places.shape[1]):
         here, before, earlier = (places[:, p - i] for i in range(3))
         bend = here[:, None, None] - 2 * before[:, None, :, None] + earlier[:, :, None, None]
@@ -120,9 +123,10 @@ def rough_near(carrier_m: Tensor, near_m: Tensor, before_m: Tensor, fringe_m: fl
 
 
 def _local_median(x: Tensor) -> Tensor:
-    """Median of each value (trial, pulse) and its neighbours; at the ends of the nearest ones.
+    """Median of each value (trial, pulse) and its neighbours, 25 in all; at the ends, the nearest
+    such median.
 
-    There are 25 of them: at the ends of recordings ten envelopes in a row were wrong.
+    There are so many because ten envelopes in a row were wrong at the ends of recordings.
     """
     pulses, width = x.shape[-1], min(25, x.shape[-1])
     medians = x.unfold(-1, width, 1).median(-1).values
@@ -131,7 +135,8 @@ def _local_median(x: Tensor) -> Tensor:
 
 
 def moved(profiles: Tensor, frequency_hz: Tensor, line_of_sight_m: Tensor) -> Tensor:
-    """Remove an error of the line of sight from range profiles, with the phases.
+    """Remove an error of the line of sight from range profiles: from their envelopes and their
+    phases.
 
     Args:
         profiles: Range profiles, shape (..., pulse, range), complex.
@@ -159,7 +164,7 @@ def matched_m(profiles: Tensor, model: Tensor, frequency_hz: Tensor, reach_m: fl
         best, float64 (pulse,).
     """
     products = frequency_samples(profiles) * frequency_samples(model).conj()
-    # twelve samples of a fringe, by choice: the maximum is then found by a parabola
+    # twelve samples per fringe, by choice; the maximum is then found by a parabola
     step = LIGHT_M_S / (2 * float(frequency_hz.mean())) / 12
     count = max(1, math.ceil(reach_m / step))
     tried = step * torch.arange(-count, count + 1, dtype=torch.float64, device=products.device)
@@ -170,10 +175,10 @@ def matched_m(profiles: Tensor, model: Tensor, frequency_hz: Tensor, reach_m: fl
 
 
 def drift_m(profiles: Tensor, frequency_hz: Tensor, imaging: Imaging, slopes: bool) -> Tensor:
-    """Find how envelopes drift against the phases, by the entropy of the image.
+    """Find how envelopes drift relative to the phases, by the entropy of the image.
 
-    The drift is a polynomial of time that moves the envelopes and leaves the phase of the carrier
-    as it is.
+    The drift is a polynomial of time that moves the envelopes and does not change the phase of the
+    carrier.
 
     Args:
         profiles: Range profiles with the phases that focus them, shape (pulse, range), complex.
@@ -188,10 +193,11 @@ def drift_m(profiles: Tensor, frequency_hz: Tensor, imaging: Imaging, slopes: bo
     samples, pulses = frequency_samples(profiles), len(profiles)
     # a drift of 0.4 cells is the unit of the search, so that its first step is small
     unit = 0.4 * LIGHT_M_S / (2 * float(frequency_hz[-1] - frequency_hz[0]))
-    rate = (frequency_hz - frequency_hz.mean()) * (-2 / LIGHT_M_S)  # turns per metre
+    rate = (frequency_hz - frequency_hz.mean()) * (-2 / LIGHT_M_S)  # cycles per metre
     time = torch.linspace(-1, 1, pulses, dtype=torch.float64, device=samples.device)
-    # Polynomials up to degree 6, by trial. Those of degree 2 and more are held outside of 0.8 of
-    # the record, because a Hann window leaves less than a tenth there and the ends would run away.
+    # Polynomials up to degree 6, by trial. Those of degree 2 and more are constant outside of the
+    # middle 0.8 of the record. The Hann window is below a tenth there, so that the ends would be
+    # hardly determined.
     bent = legendre(time.clamp(-0.8, 0.8), 6)[:, 2:]
     basis = torch.cat([time[:, None], bent], 1).mT * unit
 
@@ -207,12 +213,12 @@ def drift_m(profiles: Tensor, frequency_hz: Tensor, imaging: Imaging, slopes: bo
         log = torch.log((power / total).clamp_min(torch.finfo(power.dtype).tiny))
         value = -(power * log).sum() / total
         back = frequency_samples(imaging.adjoint(image * (-(log + value) / total)))
-        # d samples / d drift = 2j pi rate samples
+        # derivative of the samples by the drift: 2j pi rate times the samples
         of_pulse = (-4 * math.pi) * ((back.conj() * at).imag.double() * rate).sum(-1)[0]
         return value.double()[None], (basis @ of_pulse)[None]
 
     start = torch.zeros(1, len(basis), dtype=torch.float64, device=samples.device)
-    if slopes:  # of up to 6 cells at the ends of the record, in steps of 0.6 cells
+    if slopes:  # linear drifts of up to 6 cells at the ends of the record, in steps of 0.6 cells
         tried = torch.nn.functional.pad(torch.arange(-10, 11).to(start)[:, None] * (0.6 / 0.4), (0, len(basis) - 1))
         costs = [entropy(imaging.image(range_profiles(shifted(x[None]))))[0].double() for x in tried]
         start = tried[torch.stack(costs).argmin(), None]

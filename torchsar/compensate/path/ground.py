@@ -1,4 +1,4 @@
-"""The ground that autofocus images along a path, and estimates of single trials."""
+"""The ground that autofocus images along a path, and the joining of estimates of single trials."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from torchsar.radar.spotlight import frequency_step_hz
 
 # pixel spacing in resolution cells where the scene is fitted to the samples, by choice
 FINE_STEP = 0.5
-# error of the images in dB, by choice: far below what noise and side lobes leave
+# error of the images in dB, by choice, far below noise and side lobes
 ERROR_DB = -40.0
 
 
@@ -119,7 +119,8 @@ def line_free(range_m: Tensor, present: Tensor) -> Tensor:
 
 
 def placed(x: Tensor, present: Tensor) -> Tensor:
-    """Put values of the pulses that are present at their places among all, with zeros elsewhere.
+    """Put values of the pulses that are present at their positions among all pulses, with zeros
+    elsewhere.
 
     Args:
         x: Values, (n,).
@@ -132,7 +133,7 @@ def placed(x: Tensor, present: Tensor) -> Tensor:
 
 
 def slope(places: Sequence[Tensor], points_m: Tensor) -> Tensor:
-    """Return the change of half the path over points by the position of the antennas.
+    """Return the derivative of half the path to points by the position of the antennas.
 
     Args:
         places: Positions of one or both antennas, which move together, in metres, (..., 3).
@@ -148,9 +149,8 @@ def slope(places: Sequence[Tensor], points_m: Tensor) -> Tensor:
 def ground_image(
     frequency_hz: Tensor, antennas: AntennaPath, height_m: float, extent_m: float | None = None, step: float = 0.7
 ) -> TileOperator:
-    """Return the image of the ground about the origin, for one path.
-
-    Its second axis is that of the range.
+    """Return the operator that images the ground around the origin, for one path. The second axis
+    of the image is that of the range.
 
     Args:
         frequency_hz: Frequencies in Hz, float64 (range,).
@@ -167,7 +167,8 @@ def ground_image(
     """
     middle = torch.tensor([0.0, 0.0, height_m], dtype=torch.float64, device=frequency_hz.device)
     with torch.no_grad():
-        by_place = -2 * slope(antennas.places, middle)[:, :2]  # change of the path per metre, (pulse, 2)
+        # change of the path per metre of a position on the ground, (pulse, 2)
+        by_place = -2 * slope(antennas.places, middle)[:, :2]
         away = by_place.mean(0)
         steep = float(torch.linalg.vector_norm(away))
         across = torch.stack([-away[1], away[0]]) / max(steep, 1e-300)

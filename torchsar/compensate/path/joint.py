@@ -53,19 +53,21 @@ def three_axes(
     """Refine the line of sight, and find the errors across it, together with the scene.
 
     An error across the line of sight acts with opposite signs on the two sides of a scene. Each
-    round estimates the scene and the motion in three axes jointly, linear about the motion found so
-    far: a scene alone would adapt itself to the errors, and they would vanish slowly. The scene has
-    independent cells, whose variances follow from a first fit to the samples; the motion acts on
-    their phases by a polynomial of the place. Then whole fringes are added to the line of sight of
-    pulses whose envelopes match the scene so much better. The rounds end when the phases change by
-    less than a share of their standard deviation.
+    round estimates the scene and the motion in three axes jointly, linearised about the motion
+    found so far. If the scene were estimated alone, it would adapt to the errors, and they would
+    decrease slowly. The scene has independent cells, whose variances follow from a first fit to the
+    samples. The motion acts on their phases by a polynomial of the position in the scene.
+
+    Then whole fringes are added to the line of sight of pulses whose envelopes match the scene
+    clearly better with them. The rounds end when the phases change by less than a share of their
+    standard deviation.
 
     Args:
         rows: Range profiles, shape (pulse, range), complex.
         imaging: Image formation along the recorded path.
-        motion_m: Errors as found so far, recorded minus true: of half the path over the middle of
-            the scene, or besides along two axes across the line of sight, see `Found`, in metres,
-            float64 (pulse,) or (pulse, axis).
+        motion_m: Errors in metres as found so far, recorded minus true: those of half the path over
+            the middle of the scene, float64 (pulse,). Or these and the errors along two axes across
+            the line of sight, see `Found`, float64 (pulse, axis).
         present: True for the pulses of the profiles among all pulses.
         rounds: Largest number of rounds, at least 1.
         ends: When the fits of the scene end, see `Scene`.
@@ -85,19 +87,20 @@ def three_axes(
         scene = scene.narrowed(cells)
         unit, lever = _units(scene.imaging, cells, axes)
         motion = Motion(unit, found[:, 0], scene.noise)
-        # the prior is that of the whole motion across; that along the line of sight has none
+        # the prior applies to the whole motion across the line of sight; the motion along it has
+        # none
         across = pad(found[:, 1:], (1, 0))
         _, left = replace(scene, rows=rows + motion.echo(across)).fitted(motion.without)
         whole = motion.of(left)
         left = left - motion.echo(whole)
         noise = scene.noise_of(left)
-        # the variance exceeds that for a known scene by a tenth, by trial
+        # the standard deviation exceeds that for a known scene by a tenth of the variance, by trial
         std = motion.std_m() * (1.1 * noise / scene.noise).sqrt()
         fringes = _fringes(rows, rows - left, plan.frequency_hz, noise)
         before, found = found, found + (whole - across)
         found[:, 0] = line_free(found[:, 0] + fringes * fringe, present)
         change = (lever @ (found - before)[..., None]).square().mean()
-        # by choice: a change of 0.3 standard deviations is small
+        # a change of less than 0.3 standard deviations is small, by choice
         if change <= 0.3**2 * std.square().mean() and not bool(fringes.any()):
             break
     assert noise is not None
@@ -107,7 +110,7 @@ def three_axes(
 
 
 def _along(imaging: TileOperator, offset_m: Tensor) -> TileOperator:
-    """Image formation along the recorded path less its errors."""
+    """Image formation along the recorded path after its errors are subtracted."""
     path = corrected(imaging.plan.antennas, offset_m)
     return TileOperator(imaging.plan.moved(path.transmitter_m, path.receiver_m, path.reference_m))
 
@@ -124,13 +127,14 @@ def _axes(antennas: AntennaPath, height_m: float) -> Tensor:
 
 
 def _units(operator: TileOperator, scene: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
-    """Derivative of the samples by the motion along each axis, per metre, (pulse, range, axis), and
-    derivative of half the path over some places of the scene, (pulse, place, axis).
+    """Derivative of the samples by the motion along each axis, per metre, (pulse, range, axis).
 
-    scene: cells, (azimuth, range).
+    Also returns the derivative of half the path over nine places of the scene, (pulse, place,
+    axis). scene: cells, (azimuth, range).
     """
     grid = operator.plan.grid
-    # three places along either axis show the effect of a motion as a polynomial of second order
+    # three places along either axis determine the effect of a motion as a polynomial of second
+    # order
     some = [torch.linspace(0, n - 1, 3).round().long() for n in grid.counts]
     lines = (torch.linspace(-1, 1, n, dtype=torch.float64, device=scene.device) for n in grid.counts)
     u, v = torch.meshgrid(*lines, indexing="ij")
@@ -140,7 +144,8 @@ def _units(operator: TileOperator, scene: Tensor, axes: Tensor) -> tuple[Tensor,
     lever = (slope(operator.plan.antennas.places, places[:, None])[..., None, :] * axes).sum(-1).movedim(0, 1)
     share = torch.linalg.pinv(known.mT) @ lever  # (pulse, term, axis)
     radians = 4j * math.pi * float(operator.plan.frequency_hz.mean()) / LIGHT_M_S
-    # one after another, with the tables of the other images
+    # the terms are processed one after another, so that they use the same tables as the other
+    # images
     echo = torch.stack([operator.adjoint((scene * term)[None])[0] for term in terms.to(scene.real.dtype)], -1)
     return echo @ (radians * share).to(scene.dtype), lever
 
@@ -148,9 +153,12 @@ def _units(operator: TileOperator, scene: Tensor, axes: Tensor) -> tuple[Tensor,
 def _fringes(
     rows: Tensor, model: Tensor, frequency_hz: Tensor, noise: Tensor, most: int = 4, gain: float = 10.0
 ) -> Tensor:
-    """Whole fringes by which recorded ranges exceed true ones, float64 (pulse,), up to `most`: the
-    envelopes of range profiles then lie nearer than those of the model. 0 where the logarithm of
-    the likelihood does not rise by `gain`, which noise alone does in one of ten thousand pulses.
+    """Whole fringes by which recorded ranges exceed the true ones, float64 (pulse,), at most
+    `most`.
+
+    With them, the envelopes of the range profiles lie nearer to those of the model. The number is 0
+    where the log likelihood does not rise by `gain`, which noise alone does in one of ten thousand
+    pulses.
     """
     number = torch.arange(-most, most + 1, dtype=torch.float64, device=rows.device)
     middle = frequency_hz.mean()
@@ -166,7 +174,7 @@ class Motion:
 
     The motion along the line of sight is free at each pulse. The two axes across have a Gaussian
     prior of mean zero, with the spectrum of the motion along the line of sight. With the normal
-    equations N of a pulse, the free motion is eliminated: the axes across keep
+    equations N of a pulse, the free motion is eliminated. The equations of the axes across then are
     N_ik - N_i0 N_0k / N_00.
 
     Args:
@@ -192,7 +200,9 @@ class Motion:
         self.factor = torch.linalg.cholesky(torch.cat(parts) + torch.diag(self.ridge))
 
     def of(self, rows: Tensor) -> Tensor:
-        """Most probable motion in metres, float64 (pulse, axis), that made samples."""
+        """Most probable motion in metres, float64 (pulse, axis), for given changes of the
+        samples.
+        """
         pull = (self.unit.mH @ rows[..., None])[..., 0].real.double()
         rest = torch.cat([self.basis.mT @ (pull[:, i] - self.share[:, i - 1] * pull[:, 0]) for i in (1, 2)])
         across = self.basis @ torch.cholesky_solve(rest[:, None], self.factor).reshape(2, -1).mT
@@ -203,11 +213,11 @@ class Motion:
         return (self.unit @ motion_m[..., None].to(self.unit.dtype))[..., 0]
 
     def without(self, rows: Tensor) -> Tensor:
-        """Samples less what a motion explains of them."""
+        """Samples after the part that a motion explains is subtracted."""
         return rows - self.echo(self.of(rows))
 
     def std_m(self) -> Tensor:
-        """Standard deviation of the line of sight for a known scene, float64 (pulse,)."""
+        """Standard deviation of the line of sight in metres for a known scene, float64 (pulse,)."""
         count = self.basis.shape[-1]
         spread = torch.cholesky_inverse(self.factor).reshape(2, count, 2, count)
         across = torch.einsum("pa,iakb,pb->pik", self.basis, spread, self.basis)
@@ -251,7 +261,8 @@ def expected_power(power: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Prior of a scene, independent Gaussian cells of known standard deviations, and its fit.
+    """Prior of a scene, whose cells are independent and Gaussian with known standard deviations,
+    and its fit.
 
     Args:
         rows: Range profiles, shape (pulse, range), complex.
@@ -292,7 +303,8 @@ class Scene:
             length = power / or_one(bend)
             step = length.to(size.dtype)
             cells, left = cells + step * toward, left - step * echo
-            if length * power <= self.ends[1] * self.noise * left.numel():  # by which this step lowered the cost
+            # the left side is the decrease of the cost by this step
+            if length * power <= self.ends[1] * self.noise * left.numel():
                 break
             gradient = size * self.imaging.image(without(left)[None])[0] - self.noise.to(size.dtype) * cells
             now = _energy(gradient)
@@ -300,12 +312,12 @@ class Scene:
         return size * cells, left
 
     def noise_of(self, left: Tensor) -> Tensor:
-        """Variance of the noise from the samples that a fit leaves.
+        """Variance of the noise, from the residual of a fit.
 
-        A fit explains some of the noise. A cell of fixed size would take the share w of the noise
+        A fit explains a part of the noise. A cell of fixed size would take the share w of the noise
         of its samples. The size follows the noise too: with w = (p / (p + c))^2, where p is the
-        power of the cell, the divergence of the fit (Stein 1981, Annals of Statistics 9) is
-        w (3 - 2 sqrt(w)).
+        power of the cell, the divergence of the fit (Stein 1981, Annals of Statistics 9) is w (3 -
+        2 sqrt(w)).
         """
         resolved = self.rows.numel() * self.pixels
         gain = self.size.double().square() * resolved
@@ -314,8 +326,10 @@ class Scene:
         return _noise(left, 1 - explained.clamp_max(0.9), self.rows)
 
     def narrowed(self, cells: Tensor) -> Scene:
-        """The scene with the sizes that its most probable reflectivities (azimuth, range) have, and
-        at least 1e-4 of their mean variance.
+        """The scene with standard deviations that follow from the most probable reflectivities,
+        (azimuth, range).
+
+        The variance of a cell is raised by 1e-4 of the mean power.
         """
         power = cells.abs().square()
         return replace(self, size=_sizes(power + 1e-4 * power.mean(), self.rows, self.noise))
@@ -324,7 +338,8 @@ class Scene:
 def scene_of(
     rows: Tensor, imaging: TileOperator, noise: Tensor | None = None, ends: tuple[int, float] = (40, 0.01)
 ) -> Scene:
-    """The scene whose sizes follow from a Wiener estimate of the image of range profiles.
+    """Return the scene whose standard deviations follow from a Wiener estimate of the image of
+    range profiles.
 
     Args:
         rows: Range profiles, shape (pulse, range), complex.
@@ -348,7 +363,7 @@ def scene_of(
     point = torch.zeros_like(image[None])
     point[0, image.shape[0] // 2, image.shape[1] // 2] = 1
     pixels = _energy(imaging.image(imaging.adjoint(point))) / rows.numel() ** 2
-    for dim in (-1, -2):  # averages over three neighbours along either axis
+    for dim in (-1, -2):  # average over three neighbours along either axis
         power = (power.roll(1, dim) + 2 * power + power.roll(-1, dim)) / 4
     return Scene(rows, imaging, _sizes(power * weight, rows, noise), noise, pixels, ends)
 
@@ -374,5 +389,5 @@ def _noise(left: Tensor, share: Tensor, rows: Tensor) -> Tensor:
 
 
 def _energy(x: Tensor) -> Tensor:
-    """Sum of the squares of an image, float64."""
+    """Energy of an image, float64."""
     return x.abs().square().double().sum()

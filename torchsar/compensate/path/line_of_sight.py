@@ -1,6 +1,7 @@
 """Autofocus of a path through the images along it.
 
-Errors of the path move phases and envelopes; a phase per pulse leaves the envelopes where they are.
+Errors of the path move phases and envelopes. A correction of the phase per pulse does not move the
+envelopes back.
 """
 
 from __future__ import annotations
@@ -141,8 +142,8 @@ def path_autofocus(
         search = Search(some, frequency_hz, coarse, present)
         results = found_from_starts(search, imaging(FINE_STEP), rounds)
         best = results.best
-        # where noise is below a twentieth of the power, up to two rounds take finer cells, by
-        # trial: at 20 dB and errors of 5 cm the error fell from 1.66 to 1.50 bounds
+        # If noise is below a twentieth of the power, up to two rounds use finer cells, by trial. At
+        # 20 dB and errors of 5 cm, the error fell from 1.66 to 1.50 times the Cramer-Rao bound.
         if best.noise < 0.05 * some.abs().square().double().mean():
             last = three_axes(some, imaging(0.33), best.motion_m, present, 2, ends=(120, 0.001))
             if last.noise <= best.noise and last.restless <= assessment.RESTLESS:
@@ -156,7 +157,7 @@ def path_autofocus(
 
 
 def _spread(found: Estimate, present: Tensor) -> Estimate:
-    """The estimate of all pulses from that of those which are present."""
+    """Interpolate the estimate for the pulses that are present to all pulses."""
     at = present.nonzero()[:, 0]
     every = torch.arange(len(present), device=present.device)
     high = torch.searchsorted(at, every).clamp(1, len(at) - 1)
@@ -239,7 +240,7 @@ class _PathEstimator(Stage):
         settings: Options of the function `find` of the stage.
     """
 
-    # function of profiles, frequencies and antennas, and its further settings
+    # function of profiles, frequencies, antennas and its own settings
     find: Callable[..., Estimate]
 
     def __init__(self, **settings: float | tuple[float, float] | None) -> None:
@@ -313,7 +314,8 @@ class PathAutofocus(_PathEstimator):
 
 
 class CorrectPath(Stage):
-    """Recorded positions less their estimated errors, for the stages that image any path.
+    """Stage that subtracts the estimated errors from recorded positions, for the stages that image
+    any path.
 
     >>> import torch
     >>> from torchsar import compensate, core, radar

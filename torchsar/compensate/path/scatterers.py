@@ -1,4 +1,4 @@
-"""Prominent scatterers of a strip, and their echoes at the pulses that see them."""
+"""Prominent scatterers of a strip, and their echoes in the pulses that illuminate them."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ def prominent_places(image: Tensor, grid: ImageGrid, cells: tuple[float, float],
         ]
         return max_pool2d(power[None], (2 * half[0] + 1, 2 * half[1] + 1), 1, (half[0], half[1]))[0]
 
-    # the strongest one within the first, and not weaker than a hundredth of the strongest one
-    # within the second, whose side lobe it may be, by choice
+    # A scatterer is the brightest pixel within the first distances, by choice. Within the second
+    # ones it is not weaker than a hundredth of the brightest, of which it might be a side lobe.
     alone = (power == strongest((6, 2))) & (power > 0.01 * strongest((100, 2)))
-    # by choice: speckle of a million cells exceeds 14 times its mean in half of the images, and 20
-    # times it in one of 500
+    # Speckle of a million cells exceeds 14 times its mean in half of the images, and the chosen 20
+    # times in one of 500.
     at = (alone & (power > 20.0 * clutter)).nonzero()
     at = at[power[at[:, 0], at[:, 1]].argsort(descending=True)[:most]]
     log = power.double().clamp_min(torch.finfo(torch.float64).tiny).log()
@@ -56,7 +56,7 @@ def prominent_places(image: Tensor, grid: ImageGrid, cells: tuple[float, float],
 
 
 def _refined(log: Tensor, at: Tensor, dim: int) -> Tensor:
-    """Maximum of the parabola through three pixels along one axis, as an index."""
+    """Index of the maximum of the parabola through three pixels along one axis."""
     step = torch.eye(2, dtype=torch.int64, device=at.device)[dim]
     inside = (at[:, dim] > 0) & (at[:, dim] < log.shape[dim] - 1)
     near = (log[tuple((at + side * step * inside[:, None]).mT)] for side in (-1, 0, 1))
@@ -65,10 +65,10 @@ def _refined(log: Tensor, at: Tensor, dim: int) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Echoes:
-    """Echoes of scatterers along a path, each compressed in range at its place.
+    """Echoes of scatterers along a path, each compressed in range at its position.
 
-    The pulses that see a scatterer follow one another; all scatterers have as many, of which some
-    may not be seen.
+    The pulses that illuminate a scatterer follow one another. The same number of pulses is kept for
+    all scatterers, some of which may not illuminate it.
 
     Args:
         pulses: Numbers of the pulses, int64 (scatterer, seen).
@@ -121,7 +121,8 @@ class Echoes:
         legs = [torch.linalg.vector_norm(place - places_m[:, None], dim=-1) for place in at]
         path = (2 if len(legs) == 1 else 1) * torch.stack(legs).sum(0) - antennas.reference_m[pulses]
         weighted = history * weights.to(history.real.dtype)
-        step = max(1, (1 << 21) // max(1, length * len(frequency_hz)))  # blocks of two million samples, by choice
+        # blocks of two million samples, by choice
+        step = max(1, (1 << 21) // max(1, length * len(frequency_hz)))
         parts = [
             (weighted[number] * unit_phasor(way[..., None] / LIGHT_M_S * frequency_hz, history.dtype)).sum(-1)
             for way, number in zip(path.split(step), pulses.split(step), strict=True)
@@ -131,11 +132,11 @@ class Echoes:
 
     @property
     def wave(self) -> float:
-        """Change of the phase by half the path, in rad per metre, at the middle of the band."""
+        """Derivative of the phase by half the path, in rad per metre, at the middle of the band."""
         return 4 * math.pi * float(self.weights @ self.frequency_hz) / LIGHT_M_S
 
     def crossed(self, model: Tensor) -> Tensor:
-        """Return what the echoes hold of the other scatterers.
+        """Return the part of each echo that the other scatterers contribute.
 
         Args:
             model: Echo of each scatterer alone at its own place, complex (scatterer, seen).
@@ -149,10 +150,13 @@ class Echoes:
 
     @cached_property
     def _pairs(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Pairs of scatterers at nearly the same range: the numbers of both, the indices of the
-        pulses of the first among those of the second, and the response there.
+        """Pairs of scatterers at nearly the same range, and the response of one at the range of the
+        other.
+
+        Returns the numbers of both, the indices of the pulses of the first among those of the
+        second, and the response there.
         """
-        # echoes are separated up to path differences of four range cells, by choice
+        # pairs are considered up to path differences of four range cells, by choice
         reach, steps = 4.0 * LIGHT_M_S / float(self.frequency_hz[-1] - self.frequency_hz[0]), 1024
         first, middle = self.pulses[:, 0], self.path_m.mean(1)
         near = (middle[:, None] - middle).abs() < 2 * reach
@@ -165,7 +169,7 @@ class Echoes:
         both &= self.seen[one] & self.seen[other].gather(1, at)
         off = self.path_m[one] - self.path_m[other].gather(1, at)
         carrier = float(self.weights @ self.frequency_hz)
-        # response to path differences without the carrier, from a table
+        # response as a function of the path difference without the carrier, from a table
         grid = torch.linspace(0, 1, steps, dtype=torch.float64, device=off.device) * reach
         table = torch.cos(torch.outer(grid, self.frequency_hz - carrier) * (2 * math.pi / LIGHT_M_S)) @ self.weights
         place = (off / reach).abs() * (steps - 1)

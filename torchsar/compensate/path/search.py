@@ -1,4 +1,6 @@
-"""Search for the line of sight of each pulse: its phase, and its envelope for whole fringes."""
+"""Search for the line of sight of each pulse: by its phase, and by its envelope for whole
+fringes.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,7 @@ _AS_WELL = 1.1
 
 
 def _intensity(power: Tensor, mean: Tensor) -> Tensor:
-    """Weights of image cells that sharpen by the sum of the squared intensity."""
+    """Weights of image cells that raise the sum of the squared intensity."""
     return power / mean
 
 
@@ -63,15 +65,15 @@ class Search:
 
     @property
     def fringe_m(self) -> float:
-        """Half a wavelength."""
+        """Half a wavelength in metres."""
         return LIGHT_M_S / (2 * float(self.frequency_hz.mean()))
 
     def metres(self, phase_rad: Tensor) -> Tensor:
-        """Range that has a phase."""
+        """Range in metres that corresponds to a phase."""
         return phase_rad.double() * (self.fringe_m / (2 * math.pi))
 
     def windowed(self, share: float) -> Tensor:
-        """Profiles with Hann windows over pulses and over a share of the band."""
+        """Profiles with Hann windows over the pulses and over a share of the band."""
         pulses, n = self.rows.shape
         real = real_dtype(self.rows.dtype)
         k = torch.linspace(-1, 1, n, dtype=torch.float64, device=self.rows.device) / share
@@ -81,23 +83,28 @@ class Search:
         return range_profiles(samples)
 
     def sharpened(self, rows: Tensor, range_m: Tensor, start: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Phases that sharpen the image of rows at a line of sight, and the corrected rows."""
+        """Phases that sharpen the image of rows with the errors range_m of the line of sight
+        removed, and the rows without these errors.
+        """
         at = moved(rows, self.frequency_hz, range_m)
         columns = at.mT[None].contiguous()
         phase = torch.zeros_like(columns[:, 0].real) if start is None else start[None]
-        for weights, iterations in ((_intensity, 30), (_surprise, 12)):  # both end at steps of 0.03 rad, by trial
+        # both end at steps of 0.03 rad, by trial
+        for weights, iterations in ((_intensity, 30), (_surprise, 12)):
             phase = fixed_point(columns, phase, Run(weights, Through(self.imaging), iterations, 1.0, 0.03))[0]
         return phase[0], at
 
     def by_phases(self, share: float) -> Tensor:
-        """Phases (pulse,) that sharpen the image in a share of the band, with envelopes at rest."""
+        """Phases (pulse,) that sharpen the image in a share of the band, while the envelopes remain
+        unchanged.
+        """
         rows = self.windowed(share)
         columns, rest = rows.mT[None], torch.zeros(len(rows), dtype=torch.float64, device=rows.device)
         start = pair_phase(columns, torch.ones_like(columns[:, 0].real, dtype=torch.bool))[0]
         return self.sharpened(rows, rest, start)[0]
 
     def by_envelopes(self, first_band: float) -> tuple[Tensor, Tensor]:
-        """Line of sight with whole fringes before the last step, and its roughness.
+        """Line of sight with whole fringes, found with the envelopes, and its roughness.
 
         first_band: Share of the band in which the first phases are found.
         """
@@ -107,7 +114,8 @@ class Search:
         range_m, rough = torch.zeros_like(carrier), roughness(carrier, fringe)
         if rough < _ROUGH:
             range_m, phase = line_free(smoothest(carrier, fringe), self.present), None
-        # each round corrects the envelopes in a share of the band by some range cells, by trial
+        # each round corrects the envelopes by up to `reach` range cells in a share of the band, by
+        # trial
         for turn, (share, reach) in enumerate(((0.5, 4.0), (1.0, 2.0), *[(1.0, 0.5)] * 4)):
             rows, before = self.windowed(share), range_m
             phase, at = self.sharpened(rows, range_m, phase)
@@ -125,18 +133,22 @@ class Search:
         return range_m, rough
 
     def polished(self, range_m: Tensor, imaging: TileOperator) -> Tensor:
-        """Line of sight whose phases match a Wiener estimate of the scene, with the envelopes kept.
+        """Line of sight whose phases match a Wiener estimate of the scene; the envelopes remain
+        unchanged.
 
         imaging: Image formation of the scene.
         """
         columns = moved(self.rows, self.frequency_hz, range_m).mT[None].contiguous()
-        # by trial: more iterations drift off, as errors across the line of sight are not known yet
+        # By trial. With more iterations the phases drift away, because errors across the line of
+        # sight are not known yet.
         run = Run(Wiener(), Through(imaging), 10, 1.0, 1e-3)
         phase, _ = fixed_point(columns, torch.zeros_like(columns[:, 0].real), run)
         return line_free(range_m + self.metres(phase[0]), self.present)
 
     def with_envelopes(self, range_m: Tensor, phase: Tensor, at: Tensor, reach_m: float, rough: Tensor) -> Tensor:
-        """Line of sight at which envelopes and phases match the image that phases sharpen."""
+        """Line of sight that matches the envelopes and phases to the image that the
+        phases sharpen.
+        """
         turned = at * cis(-phase)[:, None]
         model = self.imaging.adjoint(weighted(self.imaging.image(turned[None]), _surprise))[0]
         whole = moved(self.rows, self.frequency_hz, range_m)
@@ -145,7 +157,7 @@ class Search:
         if rough >= _ROUGH:
             return rough_near(carrier[None], near[None], range_m[None], self.fringe_m)[0]
         bends = rough * (self.fringe_m / math.sqrt(12))
-        # measurements by envelopes are taken to err by two fringes
+        # measurements by envelopes are assumed to have an error of two fringes
         known = (self.fringe_m, 2 * self.fringe_m, bends[None])
         return smooth_near(carrier[None], near[None], range_m[None], *known)[0]
 
@@ -182,7 +194,7 @@ class Starts:
 
 
 def found_from_starts(search: Search, fine: TileOperator, rounds: int) -> Starts:
-    """Find the errors from two starts, and from a third one where the two differ.
+    """Find the errors from two starts, and from a third one if the results of the two differ.
 
     Args:
         search: The search.
@@ -196,19 +208,21 @@ def found_from_starts(search: Search, fine: TileOperator, rounds: int) -> Starts
     def refined(range_m: Tensor) -> Found:
         range_m = search.polished(range_m, fine)
         sharp, noise = sharpness(fine.image(moved(search.rows, search.frequency_hz, range_m)[None])[0])
-        # Otherwise there is one round: in 43 scenes the sharpness of a start was 0.5 to 1.3 times
-        # that of noise for noise and at -10 dB, 1.0 to 2.9 times for clutter, whose errors are not
-        # found, and 3.7 to 11 times where errors were found.
+        # A start whose image is hardly sharper than noise gets one round only. In 43 scenes the
+        # sharpness was 0.5 to 1.3 times that of noise for noise and at -10 dB. It was 1.0 to 2.9
+        # times for clutter, whose errors are not found, and 3.7 to 11 times where errors were
+        # found.
         return three_axes(search.rows, fine, range_m, search.present, rounds if sharp > 1.25 * noise else 1)
 
-    # in a quarter of the band range cells are four times as long; a third start takes half of it
+    # The first start uses a quarter of the band, in which range cells are four times as long, and a
+    # third one uses half of it.
     range_m, rough = search.by_envelopes(0.25)
     results = [refined(range_m), refined(search.metres(search.by_phases(1.0)))]
     both = Starts.of(results, search, rough)
     spread = 2 * both.best.std_m.square().mean() + both.square_m2.amin()
     alone = both.others[0].noise > _AS_WELL * both.best.noise
-    # By choice, two results may differ by a mean square phase that has a Strehl ratio of 0.8 for
-    # 1.5 standard deviations, of half their power each.
+    # The phases of two results may differ, by choice, by so much that 1.5 standard deviations of
+    # half the power lower the Strehl ratio to 0.8.
     apart = 2 * -math.log(0.8) / 1.5**2
     if not (alone or spread * (2 * math.pi / search.fringe_m) ** 2 > apart):
         return both

@@ -130,7 +130,8 @@ def strip_autofocus(
             change, strip = strip.changed_m2(after), after
             if change.sqrt() < 0.15 * strip.fringe_m:
                 break
-        # increments show slow errors best: their spectrum would forbid fast ones
+        # Increments determine slow errors best. The prior spectrum from them would suppress fast
+        # errors, so that the first prior is flat.
         size = strip.line_free(strip.motion_m[:, 0])[strip.judged].square().mean()
         power = torch.full_like(strip.basis[:2], float(size) * strip.basis.shape[0] / strip.basis.shape[1])
         free = torch.stack([strip.line_free(cosine) for cosine in strip.basis.mT], -1)
@@ -140,7 +141,7 @@ def strip_autofocus(
             if fitted is None:
                 return none
             after, covariance, power, echoes = fitted
-            # without a line over the judged pulses
+            # standard deviation without the line over the judged pulses
             std = ((free @ covariance) * free).sum(-1).clamp_min(0).sqrt()
             change, strip = strip.changed_m2(after), after
             if change < 0.3**2 * std[strip.judged].square().mean():
@@ -198,7 +199,7 @@ class StripAutofocus(_PathEstimator):
 
 @dataclass(frozen=True, eq=False)
 class Strip:
-    """One trial.
+    """Data, settings and present motion of one trial of `strip_autofocus`.
 
     Args:
         history: Phase history, complex (pulse, frequency).
@@ -243,7 +244,7 @@ class Strip:
         sight = slope(antennas.places, points)
         across = normalize(torch.linalg.cross(sight, track.along.expand_as(sight), dim=-1), dim=-1)
         axes = torch.stack([sight / sight.square().sum(-1, keepdim=True), across], 1)
-        # a scatterer outside of the strip is seen together with those in it
+        # a scatterer outside of the strip is illuminated together with those inside
         away = torch.linalg.vector_norm(place - points, dim=-1).mean()
         footprint = float(away) * (math.tan(math.asin(beam.edges[1])) - math.tan(math.asin(beam.edges[0])))
         wavelength = LIGHT_M_S / float(frequency_hz.mean())
@@ -265,7 +266,7 @@ class Strip:
             raise ValueError("no pulse sees the strip within the beam; check its centre, extents and the squint")
         seen = beam.lit_pulses(place, points[pulses // 2][None])
         per = max(1, int(seen[0, 1] - seen[0, 0]))
-        # by choice: 16 periods of the fastest cosine while a scatterer is seen
+        # 16 periods of the fastest cosine while a scatterer is illuminated, by choice
         count = max(1, min(pulses - 2, 512, math.ceil(32 * pulses / per)))
         weights = window_weights("hann", len(frequency_hz), rows.device)
         return Strip(
@@ -284,16 +285,16 @@ class Strip:
 
     @property
     def fringe_m(self) -> float:
-        """Half a wavelength."""
+        """Half a wavelength in metres."""
         return LIGHT_M_S / (2 * float(self.frequency_hz.mean()))
 
     @property
     def offset_m(self) -> Tensor:
-        """Errors of the positions, (pulse, 3)."""
+        """Errors of the positions in metres, (pulse, 3)."""
         return (self.motion_m[:, None] @ self.axes)[:, 0]
 
     def changed_m2(self, after: Strip) -> Tensor:
-        """Mean square by which another round has changed the line of sight."""
+        """Mean square change of the line of sight by another round, in square metres."""
         return self.line_free((after.motion_m - self.motion_m)[:, 0])[self.judged].square().mean()
 
     def line_free(self, range_m: Tensor) -> Tensor:
@@ -313,7 +314,7 @@ class Strip:
             return None
         echoes = Echoes.of(self.history, self.frequency_hz, self.weights, antennas, found, lit)
         lever = echoes.wave * (echoes.slope[..., None, :] * self.axes[echoes.pulses]).sum(-1)
-        # half the path by displacements along the slope of the range and across it
+        # derivative of half the path by displacements along the slope of the range and across it
         ground = echoes.slope @ self.grid.axes.mT
         mean = _mean(ground, echoes.seen)
         steep = torch.linalg.vector_norm(mean, dim=-1, keepdim=True)
@@ -324,12 +325,13 @@ class Strip:
         return echoes, Curve(self.basis, echoes.pulses, lever, own)
 
     def with_increments(self) -> Strip | None:
-        """The strip with the motion that the increments of the phases show."""
+        """The strip with the motion that follows from the increments of the phases."""
         found = self.echoes()
         if found is None:
             return None
         echoes, curve = found
-        # the lag of an increment and the mean of echoes before take a 64th of the pulses, by trial
+        # the lag of an increment, and the length of the mean of echoes before it, are a 64th of the
+        # pulses, by trial
         seen = echoes.seen.shape[1]
         lag, near = max(1, round(seen / 64)), 2 * round(seen / 128) + 1
         smooth = _smooth(echoes.samples, near) * echoes.seen
@@ -358,8 +360,10 @@ class Strip:
         if found is None:
             return None
         echoes, curve = found
-        near = 2 * round(echoes.seen.shape[1] / 16) + 1  # over an eighth of the pulses, by trial
-        # phases are those along the path less what has been found
+        # mean over an eighth of the pulses, by trial
+        near = 2 * round(echoes.seen.shape[1] / 16) + 1
+        # the phases are those along the corrected path; the phase of the motion found so far is
+        # added again
         before = curve.phase(self.motion_m)
         steep = torch.linalg.vector_norm(_mean(echoes.slope @ self.grid.axes.mT, echoes.seen), dim=-1)[:, 0]
         cell = LIGHT_M_S / (2 * float(self.frequency_hz[-1] - self.frequency_hz[0]))
@@ -377,7 +381,7 @@ class Strip:
             faded = gain < 0.2 * gain.amax(1, keepdim=True)
             weight = torch.where(faded, 0.0, 2 * gain.square() / or_one(noise))
             phase = torch.where(faded, 0.0, alone.imag / or_one(gain))
-            # The range of a scatterer is known from the image, to 0.07 cells in clutter, by trial,
+            # The range of a scatterer is known from the image: to 0.07 cells in clutter, by trial,
             # and to 0.7 over the root of the SNR in noise. Its phase and azimuth are free.
             spread = cell**2 * (0.07**2 + 0.7**2 / or_one(weight.sum(1) / 2))
             known = torch.stack([torch.zeros_like(spread), steep.square() / spread, torch.zeros_like(spread)], -1)
@@ -397,7 +401,9 @@ def _smooth(x: Tensor, length: int) -> Tensor:
 
 
 def _mean(x: Tensor, seen: Tensor) -> Tensor:
-    """Mean of (scatterer, seen, term) over the pulses that are seen, (scatterer, 1, term)."""
+    """Mean of x (scatterer, seen, term) over the pulses that illuminate a scatterer, (scatterer, 1,
+    term).
+    """
     return (x * seen[..., None]).sum(1, keepdim=True) / or_one(seen.sum(1).to(x.dtype))[:, None, None]
 
 
@@ -422,7 +428,7 @@ class Curve:
     own: Tensor
 
     def phase(self, motion_m: Tensor) -> Tensor:
-        """Phase by a motion (pulse, axis), float64 (scatterer, seen)."""
+        """Phase in rad of a motion (pulse, axis), float64 (scatterer, seen)."""
         return (self.lever * motion_m[self.pulses]).sum(-1)
 
     def solved(self, phase: Tensor, weight: Tensor, power: Tensor, known: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -442,10 +448,11 @@ class Curve:
             cosine, axis * cosine); and the phase that the terms of each scatterer add, float64
             (scatterer, seen).
         """
-        axes, count, ridge = *power.shape, 1e-9  # share by which information grows, against rounding
+        # share by which the information is increased against rounding
+        axes, count, ridge = *power.shape, 1e-9
         pull = weight[..., None] * self.own
         normal = pull.mT @ self.own
-        seen = normal.diagonal(dim1=-2, dim2=-1)  # zero for a scatterer that no pulse sees
+        seen = normal.diagonal(dim1=-2, dim2=-1)  # zero for a scatterer that no pulse illuminates
         raised = torch.where(seen > 0, ridge * seen + known, 1.0)
         inverse = torch.linalg.inv(normal + torch.diag_embed(raised))
         own = (pull.mT @ phase[..., None])[..., 0]
@@ -468,7 +475,7 @@ class Curve:
 
     def _through(self, terms: Tensor) -> Tensor:
         """Products of terms (scatterer, seen, term) with the cosines, (scatterer, term, cosine),
-        some scatterers at once.
+        for 16 scatterers at a time.
         """
         parts = zip(terms.split(16), self.pulses.split(16), strict=True)
         return torch.cat([term.mT @ self.basis[pulses] for term, pulses in parts])

@@ -1,8 +1,9 @@
-"""Whether the range profiles of pulses are aligned, which every estimate of their phases requires.
+"""Check whether the range profiles of pulses are aligned, which every estimate of their phases
+requires.
 
 A pulse that is displaced in range puts the echo of a scatterer into other range cells, where the
 phases of other scatterers are. The image can then be sharpened, and two halves of the range cells
-agree, although the phases are wrong: displacements of 0.3 cell rms from pulse to pulse suffice in a
+agree, although the phases are wrong. Displacements of 0.3 cell rms from pulse to pulse suffice in a
 scene of six scatterers at 15 dB.
 """
 
@@ -14,11 +15,11 @@ from torch import Tensor
 from torchsar.compensate.pulse_phase.data import or_one
 from torchsar.core import fft_lines, power_of
 
-# Displacements in cells rms from which on profiles are not aligned, from pulse to pulse and slow
-# ones. Found by trial on 2 to 300 scatterers: the phases may be wrong from 0.2 and 0.45 on, and
-# interference of scatterers that are not resolved displaces aligned profiles by 0.25 at most.
+# Rms displacements in cells from which profiles count as not aligned: from pulse to pulse (jitter),
+# and slow ones (migration). Found by trial on 2 to 300 scatterers: the phases may be wrong from 0.2
+# and 0.45 on. Interference of unresolved scatterers displaces aligned profiles by 0.25 at most.
 LARGEST_JITTER, LARGEST_MIGRATION = 0.25, 0.4
-# fewest range cells and pulses whose displacement is estimated
+# least number of range cells, and of pulses, from which displacements are estimated
 _LEAST = 8
 
 
@@ -42,8 +43,9 @@ def displacement(spectrum: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
 
     Returns:
         The displacement from pulse to pulse (jitter), and that of the mean of neighbouring pulses
-        (migration), in range cells rms, shape (trial,) each; 0 where they do not differ from none
-        by 3 standard deviations, and where there are fewer than 8 range cells or 8 pulses.
+        (migration), rms in range cells, shape (trial,) each. They are 0 where they do not differ
+        from zero by 3 standard deviations, and where there are fewer than 8 range cells or 8
+        pulses.
     """
     cells, n = spectrum.shape[-2:]
     if cells < _LEAST or n < _LEAST:
@@ -76,8 +78,8 @@ def _four_displacements(
     """Displacements by both halves of the band, and by the nearer and the farther range cells of
     the whole band, (trial, pulse) each, float64; and which are the nearer cells, (trial, cell).
 
-    one, other, whole: powers, (trial, pulse, cell). The nearer cells hold half of what shows a
-    displacement.
+    one, other, whole: powers, (trial, pulse, cell). The nearer cells have half of the sum of the
+    squared slopes of the mean profile, and so half of the information about displacements.
     """
     profiles = [_profiles(power) for power in (one, other, whole)]
     if near is None:
@@ -89,7 +91,9 @@ def _four_displacements(
 
 
 def _shared(parts: list[Tensor], count: Tensor) -> Tensor:
-    """Displacement in cells rms that the halves of the band share, if those of the cells agree."""
+    """Rms displacement in cells that both halves of the band have in common, (trial,). It is zero
+    unless the two halves of the range cells agree. parts: displacements from `_four_displacements`.
+    """
     return torch.where(_agreement(parts[2:], count) > 3, _common(parts[:2], count), 0)
 
 
@@ -118,7 +122,8 @@ def coherent_jitter(rows: Tensor, present: Tensor) -> Tensor:
     offset = _about_centroid(spectrum)
     products = spectrum[..., 1:] * spectrum[..., :-1].conj()
     both = present[:, 1:] & present[:, :-1]
-    steps = torch.linspace(-1.5, 1.5, 61, dtype=offset.dtype, device=rows.device)  # in cells
+    # trial displacements in cells
+    steps = torch.linspace(-1.5, 1.5, 61, dtype=offset.dtype, device=rows.device)
     slopes = []
     for half in (offset > 0, offset <= 0):
         turns = torch.exp(2j * torch.pi * steps[:, None] * offset[:, None]) * half[:, None]
@@ -128,17 +133,18 @@ def coherent_jitter(rows: Tensor, present: Tensor) -> Tensor:
 
 
 def _halves(spectrum: Tensor) -> list[Tensor]:
-    """Powers (trial, pulse, cell) of the profiles of the two halves of the band, about its
-    centroid, on the same range cells.
+    """Power profiles (trial, pulse, cell) of the upper and the lower half of the band, divided at
+    its centroid, on the same range cells.
     """
     offset, lines = _about_centroid(spectrum), spectrum.mT
     return [power_of(torch.fft.ifft(lines * half[:, None])) for half in (offset > 0, offset <= 0)]
 
 
 def _about_centroid(spectrum: Tensor) -> Tensor:
-    """Frequencies from the centroid of the band within -0.5 to 0.5 cycles per cell, (trial, range).
+    """Frequencies relative to the centroid of the band within -0.5 to 0.5 cycles per cell, (trial,
+    range).
 
-    spectrum: along range, (trial, range, pulse).
+    spectrum: Fourier transform along range, (trial, range, pulse).
     """
     frequency = torch.fft.fftfreq(spectrum.shape[-2], dtype=torch.float64, device=spectrum.device)
     density = power_of(spectrum).sum(-1, dtype=torch.float64)
@@ -156,7 +162,9 @@ def _common(halves: list[Tensor], count: Tensor) -> Tensor:
 
 
 def _agreement(halves: list[Tensor], count: Tensor) -> Tensor:
-    """Correlation of a number of free values of both halves, in standard deviations, (trial,)."""
+    """Correlation between the values of both halves in standard deviations of uncorrelated values,
+    (trial,). count: number of free values.
+    """
     one, other = halves
     scatter = (one.square().sum(-1) * other.square().sum(-1)).sqrt()
     correlation = ((one * other).sum(-1) / or_one(scatter)).clamp(-1 + 1e-12, 1 - 1e-12)
@@ -164,8 +172,8 @@ def _agreement(halves: list[Tensor], count: Tensor) -> Tensor:
 
 
 def _profiles(power: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Moduli (trial, pulse, cell), the factors (trial, pulse) that give pulses unit energy, and the
-    slope (trial, cell) of the sum of the pulses.
+    """Moduli of the profiles (trial, pulse, cell), the factors (trial, pulse) that give pulses unit
+    energy, and the slope (trial, cell) along range of the sum of the scaled profiles.
     """
     profile, scale = power.sqrt(), or_one(power.sum(-1)).rsqrt()
     mean = (scale[:, None] @ profile)[:, 0]
@@ -173,10 +181,11 @@ def _profiles(power: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _displacements(profile: Tensor, scale: Tensor, slope: Tensor, parts: Tensor, present: Tensor) -> list[Tensor]:
-    """Displacements in cells by each of several parts of the range cells, (trial, pulse) each, of
-    mean zero, and zero where no pulse is present.
+    """Displacements in cells that are estimated from each of several parts of the range cells,
+    (trial, pulse) each.
 
-    profile, scale, slope: see `_profiles`. parts: the cells that are used, (trial, part, cell).
+    Their mean is zero, and they are zero where no pulse is present. profile, scale, slope: see
+    `_profiles`. parts: the cells that are used, (trial, part, cell).
     """
     slopes = slope[:, None] * parts
     count = present.sum(-1, keepdim=True).clamp_min(1)

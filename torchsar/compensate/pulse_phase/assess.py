@@ -35,10 +35,12 @@ from torchsar.compensate.pulse_phase.sharpness import scatter_of_point, sharpnes
 from torchsar.core import Estimate, Outcome, fft_lines, host_value, power_of, worst
 from torchsar.metrics.phase import phase_rmse, residual_phase
 
-# continues a method: (rows, which of the trials these are, phase to start from) -> phase
+# function that continues an autofocus method: (rows, indices of their trials, phase to start from)
+# -> phase
 Again = Callable[[Tensor, Tensor | slice, Tensor], Tensor]
 
-UNKNOWN_RAD = math.pi / math.sqrt(3)  # standard deviation of a random phase
+# standard deviation in rad of a phase that is uniform over a turn
+UNKNOWN_RAD = math.pi / math.sqrt(3)
 LEAST_STREHL = 0.8  # Strehl ratio of a well-focused image, a convention (Marechal)
 
 
@@ -65,7 +67,7 @@ def conclude(
     Returns:
         `phase_rad` of shape (..., pulse), zero with fewer than three pulses. If it is assessed, the
         standard deviation is half of the rms difference between the phases of two halves of the
-        range cells, and at least the distance of their mean from the phase; it is divided by the
+        range cells, and at least the distance of their mean from the phase. It is divided by the
         square root of the share of the band that the data occupy. `quality` is the Strehl ratio
         that follows from it, times the share of the sharpness that noise does not explain.
 
@@ -104,7 +106,7 @@ def conclude(
         # between the pulses before and after it.
         (Outcome.TOO_FEW, (unsteady > 0) | (gap > 0.36)),
         (Outcome.DISPLACED, (jitter >= LARGEST_JITTER) | (migration >= LARGEST_MIGRATION)),
-        # the sharpness of noise is predicted within 15 %
+        # the prediction of the sharpness of noise is correct within 15 %
         (Outcome.NOISE, (sharp <= 1.5 * noise) & (homogeneous == 0)),
         (Outcome.EMPTY, ~present.any(-1).reshape(trials)),
         (Outcome.SINGULAR, ~enough.reshape(trials)),
@@ -137,9 +139,10 @@ def settled(rows: Tensor, which: Tensor | slice, phase: Tensor) -> Tensor:
 def _seen(
     rows: Tensor, present: Tensor, phase: Tensor, again: Again, through: Through | None, part: slice
 ) -> tuple[Tensor, ...]:
-    """Sharpness, that of noise, standard deviation, gain of parts, 1 where a single scatterer is
-    not steady, 1 where the scene is homogeneous, jitter and migration of a block of trials,
-    (trial,) each, float64.
+    """Quantities of a block of trials from which the outcome follows, (trial,) each, float64.
+
+    In this order: sharpness, sharpness of noise, standard deviation, gain of parts, 1 where a
+    single scatterer is not steady, 1 where the scene is homogeneous, jitter, migration.
     """
     which = torch.arange(len(rows), device=rows.device)[part]
     rows, present, phase = rows[part], present[part], phase[part]
@@ -156,10 +159,11 @@ def _seen(
     apart = half_difference(halves_of_rows(rows), present, phase, partial(_disturbed, again, which, present))
     jitter, migration = displacement(spectrum, present)
     scatter, rest = scatter_of_point(focused, present)
-    # A single scatterer: the sharpness is that of one row, or the rows are side lobes of one range.
-    # Its own motion cannot be separated from a phase error, and some phases exist that make one
-    # point of several. But no phase changes its modulus: noise and weaker scatterers change it as
-    # much as the phase. It is steady if it scatters far less than the 0.52 of noise.
+    # A scene counts as a single scatterer if one row makes the sharpness, or if the rows are side
+    # lobes of one range. The motion of a single scatterer cannot be separated from a phase error,
+    # and there are phases that focus several points into one. No phase changes the modulus,
+    # however, and noise and weaker scatterers change it as much as the phase. The scatterer is
+    # steady if the scatter of its modulus is far less than the 0.52 of noise.
     single = ((sharp_rows < 1.5) & (sharp > noise)) | (different_rows(rows, power_of(rows).sum(-1)) < 1.2)
     steady = (scatter < 0.25) & (present.sum(-1) >= 32) & (rows.shape[-2] > 1)
     return (
@@ -205,7 +209,7 @@ def gain_of_parts(rows: Tensor, present: Tensor, phase: Tensor) -> Tensor:
         as many range cells, shape (trial,), float64.
     """
     gains = [torch.zeros(len(rows), dtype=torch.float64, device=rows.device)]
-    # more or fewer blocks separate right trials from a second motion less
+    # three blocks separate correct trials best from those with a second motion
     for block in rows.tensor_split(3, -2):
         if not block.shape[-2]:
             continue
@@ -290,7 +294,7 @@ def half_difference(
 
 
 def _from(again: Again, which: Tensor, halves: Sequence[Tensor], phase: Tensor) -> Sequence[Tensor]:
-    """Phases of halves that continue from the phase itself."""
+    """Phases of both halves if the method continues from the phase of all rows."""
     return [again(half, which, phase) for half in halves]
 
 
@@ -317,15 +321,20 @@ def _disturbed(
 
 
 def _moved(new: Tensor, old: Tensor, present: Tensor) -> Tensor:
-    """Rms of the change of phases (trial, pulse) about its mean and slope in rad, (trial,)."""
+    """Rms change of the phases (trial, pulse) in rad without its mean and its linear part,
+    (trial,).
+    """
     step = without_line(on_the_circle(new - old), present)
     return (torch.where(present, step, 0).square().sum(-1) / present.sum(-1).clamp_min(1)).sqrt()
 
 
 def _walk(phase: Tensor) -> Tensor:
-    """Walk of phases without a straight line, 0.4 rad rms, (pulse,): the same in every trial."""
+    """Fixed walk of the phase over the pulses without a linear part, 0.4 rad rms, (pulse,), the
+    same in every trial.
+    """
     pulse = torch.arange(phase.shape[-1], dtype=torch.float64, device=phase.device)
-    # steps that repeat nowhere: the angles are irrational parts of a turn times squares
+    # The steps do not repeat, because the angles are irrational multiples of the squared pulse
+    # number.
     walk = torch.cos(math.pi * (math.sqrt(5) - 1) * pulse.square()).cumsum(-1)
     walk = without_line(walk, torch.ones_like(walk, dtype=torch.bool))
     return (0.4 / walk.square().mean().sqrt() * walk).to(phase.dtype)

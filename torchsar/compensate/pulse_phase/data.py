@@ -333,7 +333,7 @@ def pair_products(rows: Tensor, present: Tensor) -> Tensor:
     """
     if present.device.type == "cpu" and bool(present.all()):
         return (rows[..., 1:] * rows[..., :-1].conj()).sum(-2)
-    # the last earlier pulse that holds samples; 0 where there is none
+    # index of the last earlier pulse that has samples; 0 if there is none
     index = torch.arange(present.shape[-1], device=present.device)
     before = torch.where(present, index, 0).cummax(-1).values[:, :-1]
     return torch.where(

@@ -18,11 +18,11 @@ from torchsar.compensate.pulse_phase.imaging import AlongPulses, Imaging
 from torchsar.core import block_bytes_of, cis, host_value, power_of, true_positions
 
 Weights = Callable[[Tensor, Tensor], Tensor]
-# Factors of three iterations with the weights `Wiener` along pulses. Without them an iteration
-# removes 0.2 to 1.2 of the parts of a phase error, the least in dense scenes; the factors are those
-# for which three iterations leave least of any such part (Chebyshev), in an order in which none
-# grows much. With fewer pulses than 24 an iteration removes more than 1.3 of some parts, up to 1.7
-# with 3, and the factors would not converge.
+# Relaxation factors of three successive iterations with the weights `Wiener` along pulses. With the
+# factor 1, an iteration removes 0.2 to 1.2 of the components of a phase error, the least in dense
+# scenes. With these factors, three iterations leave least of any such component (Chebyshev), and
+# their order lets none grow much in between. With fewer pulses than 24 an iteration removes more
+# than 1.3 of some components, up to 1.7 with 3 pulses, and the factors would not converge.
 WIENER_FACTORS, LEAST_PULSES_OF_FACTORS = (0.88, 3.75, 1.43), 24
 
 
@@ -50,7 +50,7 @@ class Run:
     tolerance_rad: float
 
     def of(self, trials: Tensor) -> Run:
-        """The settings of some of the trials, given by their positions."""
+        """Settings for some of the trials, given by their indices."""
         floor = self.weights.floor if isinstance(self.weights, LogAbove) else None
         if not isinstance(floor, Tensor) or floor.ndim < 3 or len(floor) == 1:
             return self
@@ -77,7 +77,8 @@ def fixed_point(rows: Tensor, phase: Tensor, run: Run, done: int = 0) -> tuple[T
     active = torch.ones_like(phase[:, 0], dtype=torch.bool)
     taken = torch.zeros_like(active, dtype=torch.int64)
     step_of = _step_of(rows, run)
-    # on an accelerator waiting for the decision costs as much as iterations that change nothing
+    # On an accelerator, the decision to stop takes as long as a few iterations without effect. It
+    # is therefore made after every fourth iteration only.
     every = 1 if rows.device.type == "cpu" else 4
     factors = run.relaxation if isinstance(run.relaxation, tuple) else (run.relaxation,)
     for number in range(done + 1, run.iterations + 1):
@@ -99,11 +100,11 @@ def fixed_point(rows: Tensor, phase: Tensor, run: Run, done: int = 0) -> tuple[T
 
 
 def _step_of(rows: Tensor, run: Run) -> Callable[[Tensor], Tensor]:
-    """The function that maps phases to the step arg sum_n x conj(A^H (w A x)) of `fixed_point`.
+    """Function that maps phases to the step arg sum_n x conj(A^H (w A x)) of `fixed_point`.
 
     If the weight of a cell depends on no other cell, and the image formation acts on each row
-    alone, the rows are processed in slabs that stay in the cache: a third of the time. The mean
-    power of the image is then that of the rows (Parseval).
+    alone, the rows are processed in slabs that fit into the cache. This takes a third of the time.
+    The mean power of the image is then that of the rows (Parseval).
     """
     size, mean = rows.shape[-2], None
     if isinstance(run.imaging, AlongPulses) and isinstance(run.weights, LogAbove) and len(rows):
@@ -260,13 +261,13 @@ def side_lobes(present: Tensor) -> Tensor:
     """
     response = torch.fft.rfft(present.to(torch.float64)).abs()
     lobes = response[:, 1:] / or_one(response[:, :1])
-    # lobes as high as the main lobe are images of the whole scene, as of every other pulse: they do
-    # not change the sharpness
+    # Side lobes as high as the main lobe repeat the whole image, for example if every other pulse
+    # is missing. They do not change the sharpness and are left out.
     return torch.where(lobes < 0.98, lobes, 0).amax(-1)
 
 
 def have_gaps(present: Tensor) -> Tensor:
-    """Say where missing pulses change the phases that sharpen an image, see `across_gaps`.
+    """Decide where missing pulses change the phases that sharpen an image, see `across_gaps`.
 
     Args:
         present: False where a pulse is missing, shape (trial, pulse).
@@ -274,18 +275,20 @@ def have_gaps(present: Tensor) -> Tensor:
     Returns:
         True where they do, shape (trial,).
     """
-    # with 0.07, a gap of a sixteenth of the record, errors of 40 points were a sixth larger
+    # With 0.07, which a gap of a sixteenth of the record does not reach, errors of 40 points were a
+    # sixth larger.
     return side_lobes(present) > 0.06
 
 
 def across_gaps(rows: Tensor, phase_rad: Tensor, iterations: int, tolerance_rad: float) -> Tensor:
-    """Compare pulses with a Wiener estimate of the scene from all pulses and fill missing ones in.
+    """Compare pulses with a Wiener estimate of the scene from all pulses, and fill in the missing
+    ones.
 
     The image of a point has side lobes where pulses are missing. Phases that shift the parts of the
-    record against each other in Doppler lower them, so that sharpness and a scene that contains
-    them find wrong phases: with a quarter of the record missing, by 0.5 rad in nearly every scene,
-    and both halves of the rows agree. With the missing pulses taken from the estimated scene there
-    are no such lobes.
+    record against each other in Doppler lower these lobes. Sharpness, and an estimate of the scene
+    that contains the lobes, therefore lead to wrong phases. With a quarter of the record missing,
+    they were wrong by 0.5 rad in nearly every scene, and both halves of the rows agreed. With the
+    missing pulses taken from the estimated scene there are no such lobes.
 
     The weights, the steps and their factors are those of `autofocus`. The missing pulses are those
     of the last estimate.
@@ -304,7 +307,8 @@ def across_gaps(rows: Tensor, phase_rad: Tensor, iterations: int, tolerance_rad:
     factors = WIENER_FACTORS if rows.shape[-1] >= LEAST_PULSES_OF_FACTORS else (1.0,)
     filled, phase = torch.zeros_like(rows), phase_rad
     active = torch.ones_like(phase[:, 0], dtype=torch.bool)
-    for number in range(-6, iterations):  # the first six fill without changing phases
+    # the first six iterations fill in missing pulses without changing phases
+    for number in range(-6, iterations):
         pulses = torch.where(present[:, None], rotate(rows, phase), filled)
         image = along.image(pulses)
         power = power_of(image)
@@ -318,7 +322,7 @@ def across_gaps(rows: Tensor, phase_rad: Tensor, iterations: int, tolerance_rad:
         phase = phase + factors[number % len(factors)] * step
         size = (min(factors) * step.detach()).square().sum(-1) / or_one(present.sum(-1))
         active = active & (size > tolerance_rad**2)
-        # on an accelerator waiting for the decision costs as much as iterations that change nothing
+        # on an accelerator, the decision to stop takes as long as iterations without effect
         if phase.device.type == "cpu" and not host_value(active.sum(), 1):
             break
     return phase

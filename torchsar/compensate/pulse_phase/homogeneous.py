@@ -15,9 +15,11 @@ from torch import Tensor
 from torchsar.compensate.pulse_phase.data import or_one, rotate
 from torchsar.core import power_of
 
-# least spectral density relative to its mean: it keeps R invertible where noise is weak
+# least spectral density relative to its mean, which keeps the covariance R of the pulses invertible
+# where noise is weak
 SPECTRAL_FLOOR = 1e-4
-# independent range cells below which a spectrum fits single scatterers as well as speckle
+# least number of independent range cells of a group: with fewer, a spectrum fits single scatterers
+# as well as speckle
 LEAST_LOOKS = 10.0
 
 
@@ -66,10 +68,11 @@ def describe(rows: Tensor, phase_rad: Tensor, independent: Tensor) -> tuple[Tens
             `occupied_band`.
 
     Returns:
-        The gain of the log likelihood of the sparse description over white noise in nats; and the
+        The gain of the log likelihood of the sparse description over white noise in nats. And the
         ratio of the gain of the homogeneous description to it, both without the part that is due to
-        the powers of the range cells: above 1 if the homogeneous description is likelier, and 0
-        where the coherence of the pulses does not exceed that of noise. Shape (trial,) each.
+        the powers of the range cells. The ratio is above 1 if the homogeneous description is
+        likelier, and 0 where the coherence of the pulses does not exceed that of noise. Shape
+        (trial,) each.
     """
     n = rows.shape[-1]
     if rows.shape[-2] > 256:  # only the 256 strongest range cells are compared
@@ -107,14 +110,17 @@ def sparse_gain_nats(power: Tensor) -> Tensor:
     Returns:
         The gain over N cells of one power in nats, shape (trial,), 0 or more, float64.
     """
-    floor, width = 1e-14, 0.02  # below this power, relative to the mean, sums are inexact
+    # least power relative to the mean, because sums are inexact below it, and relative width of a
+    # bin
+    floor, width = 1e-14, 0.02
     total, least = power[0].numel() if len(power) else 1, math.log(floor)
     bins = math.ceil((math.log(total) - least) / width) + 1
     level = ((power.flatten(1).clamp_min(floor).log() - least) / width).long().clamp(0, bins - 1)
     cells = torch.zeros(len(power), bins, device=power.device)
     cells = cells.scatter_add(-1, level, torch.ones_like(power.flatten(1)).to(cells)).to(torch.float64)
     nats = least + width * (torch.arange(bins, dtype=torch.float64, device=power.device) + 0.5)
-    # of the cells in a bin and above, and of those below
+    # count, own: number of the cells in a bin and above it, and the sum of their log powers. rest:
+    # mean power of the cells below.
     count, own = (x.flip(-1).cumsum(-1).flip(-1) for x in (cells, cells * nats))
     rest = (cells * nats.exp()).cumsum(-1).roll(1, -1)[:, 1:] / (total - count[:, 1:]).clamp_min(1)
     count, own = count[:, 1:], own[:, 1:]
@@ -125,7 +131,9 @@ def sparse_gain_nats(power: Tensor) -> Tensor:
 
 
 def _whittle(power: Tensor, looks: Tensor) -> Tensor:
-    """Mean negative log likelihood of a sample, less that of white noise, (group, trial)."""
+    """Mean negative log likelihood per sample minus that of white noise, (group, trial), in
+    Whittle's approximation.
+    """
     mean = power.mean(-1, keepdim=True)
     power = torch.where(mean > 0, torch.maximum(power, SPECTRAL_FLOOR * mean), 1)
     smooth = smoothed_spectrum(power, looks.clamp_min(1))
@@ -133,11 +141,12 @@ def _whittle(power: Tensor, looks: Tensor) -> Tensor:
 
 
 def _coherence(rows: Tensor, groups: Tensor, cells: Tensor, independent: Tensor) -> tuple[Tensor, Tensor]:
-    """Gain by the coherence of neighbouring pulses and its standard deviation in noise, (trial,).
+    """Gain of the log likelihood by the coherence of neighbouring pulses, and its standard
+    deviation in noise, (trial,) each.
 
     Groups of fewer than ten independent range cells are left out, also where the cells are many but
-    hold the side lobes of few points. To second order in the coherence the gain of a sample is the
-    sum of its squares over the lags.
+    hold the side lobes of few points. To second order, the gain of a sample is the sum over the
+    lags of the squared coherence.
     """
     n, energy = rows.shape[-1], power_of(rows)
     kinds = groups.to(energy.dtype)
@@ -145,7 +154,7 @@ def _coherence(rows: Tensor, groups: Tensor, cells: Tensor, independent: Tensor)
     row = kinds * energy.sum(-1)
     looks = row.sum(-1).square() / or_one(row.square().sum(-1)) * independent
     excess = torch.zeros_like(cells)
-    lags = min(4, n - 1)  # distances of the pulses
+    lags = min(4, n - 1)  # largest distance of the pulses
     for lag in range(1, lags + 1):
         product = torch.einsum("gtr,trp->gtp", kinds.to(rows.dtype), rows[..., lag:] * rows[..., :-lag].conj())
         square = power_of(product).sum(-1)
@@ -199,9 +208,9 @@ def smoothed_spectrum(power: Tensor, looks: Tensor) -> Tensor:
     for level in range(int(math.log2(power.shape[-1])) - 1):
         shifted = mean.roll(2**level, -1)
         detail = (mean - shifted) / 2
-        # neighbouring bins of the padded transform are not independent: two count as one
+        # neighbouring bins of the padded transform are correlated: two count as one
         std = scatter / math.sqrt(2 * max(1.0, 2 ** (level - 1)))
-        # among thousands of details about one exceeds 3.3 by chance
+        # one of some thousand details exceeds 3.3 standard deviations by chance
         details.append(torch.where(detail.abs() > 3.3 * std, detail, 0))
         mean = (mean + shifted) / 2
     for level, detail in reversed(list(enumerate(details))):

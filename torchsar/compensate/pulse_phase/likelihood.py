@@ -22,7 +22,7 @@ from torchsar.compensate.pulse_phase.data import or_one
 from torchsar.compensate.pulse_phase.homogeneous import SPECTRAL_FLOOR, occupied_band, power_groups, smoothed_spectrum
 from torchsar.core import cholesky_factor, cis, fft_lines, linear_solve, matrix_inverse, power_of
 
-PRIOR = 3 / math.pi**2  # information in 1/rad^2 of a phase that is uniform over a turn
+PRIOR = 3 / math.pi**2  # inverse variance in 1/rad^2 of a phase that is uniform over a turn
 
 Smooth = Callable[[Tensor, Tensor], Tensor]
 
@@ -74,18 +74,20 @@ class Speckle:
         return Speckle(groups, present, samples, occupied_band(fft_lines(rows)))
 
     def trials(self, at: Tensor) -> Speckle:
-        """The scenes of some of the trials, given by their indices."""
+        """Select trials by their indices."""
         groups = [(own[at], products[at], cells[at]) for own, products, cells in self.groups]
         return Speckle(groups, self.present[at], self.samples[at], self.independent[at])
 
     def cells(self, kept: Tensor) -> Speckle:
-        """The scenes with some of the range cells, given as bools (trial, range)."""
+        """Select range cells, given as booleans (trial, range)."""
         parts = [own * kept[:, None, :] for own, *_ in self.groups]
         groups = [_group(some, (some != 0).any(-2).sum(-1)) for some in parts]
         return Speckle(groups, self.present, self.present.sum(-1) * kept.sum(-1).to(torch.float64), self.independent)
 
     def blocks(self, size: int) -> Speckle:
-        """Blocks of so many pulses, (trial * block); pulses beyond the last are absent."""
+        """Divide the pulses into blocks of `size` pulses, (trial * block). Pulses beyond the last
+        one are absent.
+        """
         n = self.present.shape[-1]
         count = -(-n // size)
 
@@ -101,7 +103,8 @@ class Speckle:
         return Speckle(groups, present, samples, self.independent.repeat_interleave(count))
 
     def start(self, width: Tensor) -> Tensor:
-        """Phases of greatest likelihood for bands (shares of the pulse rate), as exp(j phase).
+        """Phases of greatest likelihood for flat Doppler bands of given widths (shares of the pulse
+        rate), as exp(j phase).
 
         Args:
             width: Band of each trial, shape (trial,).
@@ -109,13 +112,14 @@ class Speckle:
         lag = torch.arange(self.present.shape[-1], dtype=torch.float64, device=self.present.device)
         every = sum(products for _, products, _ in self.groups) / or_one(self._cells)[:, None, None]
         flat = torch.ones_like(every[:, 0])
-        band = 0.85 * torch.sinc(width[:, None] * lag) + (1 - 0.85) * (lag == 0)  # share of power in the band
+        # 85 % of the power is in the band, the rest is white
+        band = 0.85 * torch.sinc(width[:, None] * lag) + (1 - 0.85) * (lag == 0)
         lower, _ = self._factor(self._toeplitz(band.to(flat.dtype)))
         matrix = torch.cholesky_inverse(lower).mT * every
         return newton(matrix, _smallest(matrix, flat))
 
     def powers(self, u: Tensor, part: slice = slice(None)) -> list[Tensor]:
-        """Periodograms of each group over a part of the pulses, without the phases of u.
+        """Periodograms of each group over a part of the pulses, after the phases of u are removed.
 
         They are summed over the range cells, shape (trial, bin), at twice as many bins as pulses.
         """
@@ -123,7 +127,7 @@ class Speckle:
         return [power_of(torch.fft.fft(own, 2 * u.shape[-1], dim=-2)).sum(-1) for own in turned]
 
     def periodograms(self, u: Tensor, smooth: Smooth) -> list[Tensor]:
-        """Smoothed mean periodograms of each group, without the phases of u."""
+        """Smoothed mean periodograms of each group, after the phases of u are removed."""
         return self.smoothed(self.powers(u), smooth)
 
     def smoothed(self, powers: list[Tensor], smooth: Smooth) -> list[Tensor]:
@@ -135,10 +139,12 @@ class Speckle:
         ]
 
     def adapted(self, u: Tensor, fit: Fit) -> list[Tensor]:
-        """Smoothed powers of each group behind filters that suppress all other frequencies.
+        """Smoothed spectra of each group, measured with filters that pass one frequency and
+        suppress all others.
 
-        The filters are R^-1 a / (a^H R^-1 a) with the covariances of a fit, where a is a tone. A
-        periodogram raises weak parts of the spectrum by what leaks from strong ones.
+        The filters are R^-1 a / (a^H R^-1 a) with the covariances of a fit, where a is a tone
+        (Capon). In a periodogram, leakage from strong parts of the spectrum would raise the weak
+        parts.
         """
         spectra, n = [], u.shape[-1]
         kept = self.present[:, :, None] & self.present[:, None, :]
@@ -146,7 +152,7 @@ class Speckle:
             tones = torch.fft.fft(inverse.mT @ (own * u.conj()[..., None]), 2 * n, dim=-2)
             sums = torch.roll(torch.nn.functional.pad(lag_sums(inverse.mT * kept), (1, 0)), -n, -1)
             gain = torch.fft.fft(sums).real
-            # of the densities relative to the mean rounding allows 1e-8 at least
+            # rounding limits densities relative to the mean to 1e-8
             power = power_of(tones).sum(-1) / gain.square()
             spectra.append(self._smoothed(power * self.present.sum(-1)[:, None], cells, smoothed_spectrum, 1e-8))
         return spectra
@@ -158,13 +164,15 @@ class Speckle:
         return smooth(power, (cells * self.independent).clamp_min(1))
 
     def round(self, u: Tensor, spectra: list[Tensor]) -> tuple[Tensor, list[Tensor]]:
-        """A Newton step of the phases for given spectra, and the spectra adapted to the result."""
+        """Newton step of the phases for given spectra, and the spectra adapted to the new
+        phases.
+        """
         fit = self.fit(spectra)
         u = newton(fit.matrix, u, 1)
         return u, self.adapted(u, fit)
 
     def fit(self, spectra: list[Tensor]) -> Fit:
-        """The likelihood with given spectra of the groups."""
+        """Likelihood of the phases with given spectra of the groups."""
         inverses, constant = [], torch.zeros_like(self.samples)
         for (_, _, cells), spectrum in zip(self.groups, spectra, strict=True):
             lower, log_det = self._factor(self._toeplitz(torch.fft.ifft(spectrum)))
@@ -177,23 +185,24 @@ class Speckle:
         return self.samples - fit.constant - value_of(fit.matrix, u)
 
     def summed(self, each: list[Tensor]) -> Tensor:
-        """Sum over all range cells of what each cell of a group adds."""
+        """Sum over all range cells of a quantity that is given for one cell of each group."""
         return sum(
             (cells[:, None, None] * own for (*_, cells), own in zip(self.groups, each, strict=True)),
             torch.zeros_like(each[0]),
         )
 
     def information_each(self, fit: Fit) -> list[Tensor]:
-        """Fisher information of the phases in 1/rad^2 in a range cell of each group."""
+        """Fisher information of the phases in 1/rad^2 from one range cell of each group."""
         eye = torch.eye(self.present.shape[-1], dtype=torch.float64, device=self.present.device)
         covariances = [self._toeplitz(torch.fft.ifft(spectrum)) for spectrum in fit.spectra]
         return [2 * ((one * other).real - eye) for one, other in zip(fit.inverses, covariances, strict=True)]
 
     def independent_share(self, u: Tensor, fit: Fit, each: list[Tensor], of: slice = slice(None)) -> Tensor:
-        """Share of the information that counts, because range cells depend on each other, (trial,).
+        """Share of the information that is independent, (trial,), because range cells are
+        correlated.
 
         Cells that a point fills with its side lobes, or that are sampled finer than the band
-        requires, have the same innovations. What the phases gain from two cells depends as the
+        requires, have the same innovations. The information gained from two cells depends on the
         square of their correlation. Correlations of independent cells of n pulses have a mean
         square of 1 / n.
 
@@ -221,7 +230,7 @@ class Speckle:
         return torch.where(total > 0, total / or_one(total + both.clamp_min(0)), 1)
 
     def matrix(self, inverses: list[Tensor]) -> Tensor:
-        """R^-T o C, summed over the range cells, for the R^-T of each group."""
+        """Sum over the range cells of R^-T o C, for the R^-T of each group."""
         return sum(
             (one * products for one, (_, products, _) in zip(inverses, self.groups, strict=True)),
             torch.zeros_like(self.groups[0][1]),
@@ -281,7 +290,9 @@ def value_of(matrix: Tensor, u: Tensor) -> Tensor:
 
 
 def _smallest(matrix: Tensor, start: Tensor) -> Tensor:
-    """Phases, as exp(j phase), of the eigenvector of the smallest eigenvalue; inverse iteration."""
+    """Phases, as exp(j phase), of the eigenvector of the smallest eigenvalue, by inverse
+    iteration.
+    """
     n = start.shape[-1]
     ridge = 1e-6 * torch.diagonal(matrix, dim1=-2, dim2=-1).real.mean(-1)[:, None, None] + 1e-12
     lower = cholesky_factor(matrix + ridge * torch.eye(n, dtype=matrix.dtype, device=matrix.device))
@@ -335,7 +346,7 @@ def newton_step(matrix: Tensor, u: Tensor) -> Tensor:
     turned = u.conj()[..., :, None] * matrix * u[..., None, :]
     slope = turned.sum(-1)
     bend = 2 * (turned.real - torch.diag_embed(slope.real)).detach()
-    # a constant phase has no curvature and no slope
+    # the likelihood does not depend on a constant phase, which the ridge keeps at zero
     ridge = 1e-6 * torch.diagonal(matrix, dim1=-2, dim2=-1).real.mean(-1).detach()
     eye = torch.eye(u.shape[-1], dtype=torch.float64, device=u.device)
     return -linear_solve(bend + ridge[:, None, None] * eye, 2 * slope.imag)

@@ -108,7 +108,8 @@ def linked(pulses: Pulses, start: Tensor | None = None, still: bool = False, ass
         The `Estimate` that `link_phases` returns.
     """
     rows, n, trials = pulses.rows, pulses.n, pulses.trials
-    if not len(rows) or n < 3:  # nothing to distinguish a phase error from a shift of the image
+    # with fewer pulses a phase error cannot be distinguished from a shift of the image
+    if not len(rows) or n < 3:
         zero, none = torch.zeros(*trials, n, dtype=rows.real.dtype, device=rows.device), rows.real.sum((-2, -1)) * 0
         info = {"gain_nats": none.reshape(trials), "fit_nats": none.reshape(trials)}
         return Estimate({"phase_rad": zero}, outcome=Outcome.SINGULAR.like(info["gain_nats"]), info=info)
@@ -159,15 +160,16 @@ def _grown(scene: Speckle) -> Tensor:
     """Phases near those of greatest likelihood, as exp(j phase), (trial, pulse).
 
     A search over all pulses ends in local minima, in which parts of the pulses have slipped by a
-    Doppler cell. Few pulses have few minima. The phases of short blocks are therefore found first,
-    of at most 32 pulses, and neighbouring blocks are joined until one is left.
+    Doppler cell. Short blocks of at most 32 pulses have few such minima. Their phases are therefore
+    found first, and neighbouring blocks are joined until one is left.
     """
     trials, n = scene.present.shape
     size = -(-n // 2 ** max(0, math.ceil(math.log2(n / 32))))
     u = _solved(scene.blocks(size))
     while size < n:
         blocks = u.reshape(trials, -1, size)
-        if blocks.shape[1] % 2:  # the last block has no neighbour: one of absent pulses
+        # the last block has no neighbour, so that one of absent pulses is added
+        if blocks.shape[1] % 2:
             blocks = torch.cat([blocks, torch.ones_like(blocks[:, :1])], 1)
         size *= 2
         u = _joined(scene.blocks(size), blocks.reshape(-1, size))
@@ -175,9 +177,9 @@ def _grown(scene: Speckle) -> Tensor:
 
 
 def _solved(blocks: Speckle) -> Tensor:
-    """Phases of short blocks: those of greatest likelihood that are found from several bands.
+    """Phases of short blocks: the likeliest ones of searches that start from several Doppler bands.
 
-    As many bands go together as fit into the memory of a block of trials.
+    As many bands are processed together as fit into the memory of a block of trials.
     """
     count = len(blocks.samples)
     which = torch.arange(count, device=blocks.samples.device)
@@ -187,7 +189,8 @@ def _solved(blocks: Speckle) -> Tensor:
     for widths in bands.split(together):
         every = blocks.trials(which.repeat(len(widths)))
         u = every.start(widths.repeat_interleave(count))
-        for number in range(8):  # the first phases are far off
+        # the first phases are inaccurate, so that the spectrum is first smoothed more
+        for number in range(8):
             smooth = windowed_spectrum if number < 2 else smoothed_spectrum
             u = newton(every.fit(every.periodograms(u, smooth)).matrix, u)
         gain = every.gain(u, every.fit(every.periodograms(u, smoothed_spectrum)))
@@ -231,11 +234,12 @@ def _joined(pairs: Speckle, u: Tensor) -> Tensor:
 
 
 def _refined(scene: Speckle, u: Tensor) -> tuple[Tensor, Fit]:
-    """The phases of greatest likelihood for adapted spectra, and the fit with these spectra.
+    """Phases of greatest likelihood for adapted spectra, and the fit with these spectra.
 
-    Phases and spectra are found in turn. A smooth error of the phase widens the spectrum, and the
-    wider spectrum hardly opposes it; three rounds are therefore extrapolated (squared iteration)
-    where that makes the phases more likely, until they move by less than 0.3 standard deviations.
+    Phases and spectra are found in turn. A smooth error of the phase widens the estimated spectrum,
+    and the wider spectrum hardly opposes the error, so that convergence is slow. Three rounds are
+    therefore extrapolated (squared iteration) where that makes the phases likelier, until they
+    change by less than 0.3 standard deviations.
     """
     spectra = scene.periodograms(u, smoothed_spectrum)
     std = rms_of_pulses(deviation(scene.summed(scene.information_each(scene.fit(spectra)))), scene.present)
@@ -261,5 +265,5 @@ def _refined(scene: Speckle, u: Tensor) -> tuple[Tensor, Fit]:
 
 
 def _distance(u: Tensor, v: Tensor) -> Tensor:
-    """Difference of phases in rad, rms over the pulses, (trial,)."""
+    """Rms difference between phases over the pulses in rad, (trial,)."""
     return torch.angle(u * v.conj()).square().mean(-1).sqrt()

@@ -1,9 +1,11 @@
 """Assessment of linked phases: whether they can be trusted, and how exact they are.
 
-The questions are those of other phases, asked of the likelihood: is the gain over white noise more
-than that of phases of noise; is a sparse description of the scene not likelier; do parts of the
-range cells, each judged by the spectra of the others, ask for the same phases; do the pulses before
-and after every boundary belong to one scene; are the range profiles aligned?
+The questions are those of the module `assess`, in terms of the likelihood:
+
+1. Is the gain over white noise more than that of phases fitted to noise? 2. Is a sparse description
+of the scene not likelier? 3. Do parts of the range cells, each evaluated with the spectra of the
+others, give the same phases? 4. Do the pulses before and after every boundary belong to one scene?
+5. Are the range profiles aligned?
 """
 
 from __future__ import annotations
@@ -53,13 +55,13 @@ class Judged(NamedTuple):
 
 
 def judged(scene: Speckle, u: Tensor, fit: Fit, still: bool) -> Judged:
-    """Compute the deviation of linked phases, and what it rests on.
+    """Compute the deviation of linked phases and the other fields of `Judged`.
 
-    The Fisher information takes all cells of a group to have the same spectrum, and the fitted one
-    to be true. But cells of few scatterers each have their own, and a spectrum that is fitted to
-    few cells adapts to slow phase errors. Here each cell moves the phases by a Newton step for
-    spectra that other cells fit, with the curvature that these spectra give. The squares of the
-    steps add up to a variance ("sandwich" of curvature and scatter).
+    The Fisher information assumes that all cells of a group have the same spectrum, and that the
+    fitted one is correct. But cells of few scatterers each have a spectrum of their own, and a
+    spectrum that is fitted to few cells adapts to slow phase errors. Here each cell gives a Newton
+    step of the phases, with spectra and a curvature that are fitted to other cells. The squares of
+    the steps add up to a variance ("sandwich" of curvature and scatter).
 
     Args:
         scene: The pulses.
@@ -102,8 +104,8 @@ def judged(scene: Speckle, u: Tensor, fit: Fit, still: bool) -> Judged:
     some = energy * sum(
         here[:, None] * (own != 0).any(-2) for (own, *_), here in zip(scene.groups, sharing, strict=True)
     )
-    # Cells with the side lobes of few points share their spectrum too. In clutter with five points
-    # of +15 dB the cells that share it hold a quarter of the energy.
+    # Cells that hold the side lobes of few points also have a common spectrum. In clutter with five
+    # points of +15 dB, the cells that share it hold a quarter of the energy.
     known = (failed == 0) & (some.sum(-1) > 0.2 * energy.sum(-1))
     excess = torch.where(known, rms_of_pulses(scatter, scene.present) / or_one(alone), torch.inf)
     shift = torch.where(known, rms_of_pulses(steps.sum(-1), scene.present), torch.inf)
@@ -120,7 +122,7 @@ def _crossed(scene: Speckle, u: Tensor, fit: Fit, sharing: list[Tensor]) -> tupl
     """
     bend, slopes = torch.zeros_like(scene.groups[0][1].real), torch.zeros_like(scene.groups[0][0].real)
     cells = torch.arange(slopes.shape[-1], device=u.device)
-    for part in cells.tensor_split(4):  # 2 to 8 parts predict about the same
+    for part in cells.tensor_split(4):  # 2 to 8 parts predict nearly the same errors
         inside = torch.isin(cells, part).expand(len(u), -1)
         own_cells, others = scene.cells(inside), scene.cells(~inside)
         adapted = zip(others.adapted(u, fit), sharing, strict=True)
@@ -136,7 +138,7 @@ def _crossed(scene: Speckle, u: Tensor, fit: Fit, sharing: list[Tensor]) -> tupl
 def outcome_of(
     pulses: Pulses, found: Judged, gain: Tensor, sparse: bool
 ) -> tuple[Tensor, Tensor, Tensor, dict[str, Tensor]]:
-    """Conclude from what all trials tell.
+    """Derive outcome, standard deviation and quality of all trials.
 
     Args:
         pulses: The pulses.
@@ -148,17 +150,17 @@ def outcome_of(
         Outcomes; standard deviations in rad, (trial, pulse); quality; and what is for reports;
         shape (trial,).
     """
-    # Phases fit circular noise: 1.1 to 2.3 nats per pulse were measured for 4 to 192 range cells
-    # and 64 to 256 pulses. A scene must gain twice as much.
+    # Phases that were fitted to circular noise gained 1.1 to 2.3 nats per pulse, measured for 4 to
+    # 192 range cells and 64 to 256 pulses. A scene must gain twice as much.
     noise = 2.0 * pulses.present.sum(-1)
     share = (1 - noise / or_one(gain)).clamp(0, 1)
     lost = torch.where(share > 0, or_one(share).rsqrt(), torch.inf)
     std = (found.std * lost[:, None]).clamp_max(PRIOR**-0.5)
     strehl = torch.exp(-rms_of_pulses(std, pulses.present).square())
     alone = found.alone * found.excess.clamp_min(1)
-    # The errors of neighbouring pulses depend on each other, and where the spectrum has no edges a
-    # slow phase error hardly changes it, so that the rms error of a scene may exceed its standard
-    # deviation by this factor, and by more with fewer than 24 range cells.
+    # The rms error of a scene may exceed its standard deviation by a factor of 1.9, and by more
+    # with fewer than 24 range cells. The errors of neighbouring pulses are correlated, and where
+    # the spectrum has no edges, a slow phase error hardly changes it.
     spread = 1.9**2 * (24 / found.rows.clamp_min(1)).clamp_min(1)
     spectrum = fft_lines(pulses.rows)
     jitter, migration = displacement(spectrum, pulses.present)
@@ -194,12 +196,13 @@ def outcome_of(
 
 
 def _weakest_boundary(matrix: Tensor, u: Tensor, information: Tensor) -> Tensor:
-    """Least coherence of the pulses before and after a boundary, over that of the model, (trial,).
+    """Least coherence of the pulses before and after a boundary relative to that of the model,
+    (trial,).
 
-    It is the part of the log likelihood that pairs of pulses across the boundary contribute: it
-    would change its sign with the phases of all later pulses. Its expectation for a covariance R
-    is that of u^H (R^-T o C) u, which is half of the Fisher information. Boundaries in the first
-    and the last sixteenth of the pulses are left out.
+    The coherence is the part of the log likelihood that pairs of pulses across the boundary
+    contribute. It would change its sign if the signs of all later pulses changed. Its expectation
+    for a covariance R is that of u^H (R^-T o C) u, which is half of the Fisher information.
+    Boundaries in the first and the last sixteenth of the pulses are left out.
     """
     skipped = u.shape[-1] // 16
 

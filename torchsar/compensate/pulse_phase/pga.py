@@ -271,11 +271,11 @@ class PgaSca(_PhaseEstimator):
 
 @dataclass(frozen=True)
 class _Search:
-    """The iterations of PGA.
+    """The iterations of PGA, as a function of (rows, present, start).
 
-    Maps (rows, present, start) to the phase of the sharpest iterate (trial, pulse) and the number
-    of iterations (trial,). Patience is counted only once the window no longer narrows: in clutter,
-    wide windows blur for many iterations what narrow ones sharpen later.
+    It returns the phase of the sharpest iterate (trial, pulse) and the number of iterations
+    (trial,). Patience is counted only once the window no longer narrows: in clutter, wide windows
+    blur for many iterations what narrow ones sharpen later.
     """
 
     kernel: Kernel
@@ -339,7 +339,8 @@ def window_width(windows: Windows, iteration: int, view: View) -> Tensor:
         return torch.tensor([max(floor, 0.5 * n * 0.8**iteration)])
     if windows != "measured":
         return torch.tensor([windows[min(iteration, len(windows) - 1)]])
-    # power about the peaks, summed over the range cells; padded cells are skipped
+    # power at each distance from the peaks, summed over the range cells; cells that padding adds
+    # are skipped
     index = torch.arange(0, _PADDING * n, _PADDING, device=view.peak.device) + view.peak[..., None]
     about = view.power.gather(-1, torch.remainder(index, _PADDING * n)).sum(-2)
     folded = torch.maximum(about, about.flip(-1).roll(1, -1))[..., : n // 2 + 1]
@@ -350,7 +351,7 @@ def window_width(windows: Windows, iteration: int, view: View) -> Tensor:
 
 @dataclass(frozen=True)
 class View:
-    """Padded image of pulses, and what is read in it.
+    """Padded image of pulses, its power, and the peaks of its range cells.
 
     Args:
         image: Image, shape (trial, range, 2 pulse), complex.
@@ -366,7 +367,7 @@ class View:
 
     @staticmethod
     def of(rows: Tensor, present: Tensor, phase: Tensor) -> View:
-        """Form the image of pulses with a phase removed."""
+        """Form the padded image of pulses after a phase is removed."""
         image = torch.fft.fft(rotate(rows, phase), _PADDING * rows.shape[-1], norm="ortho")
         power = power_of(image.detach())
         return View(image, power, power.max(-1).indices, present)
@@ -383,15 +384,16 @@ class View:
         return near * (offsets.abs() <= half[:, None, None]) if bool((half < reach).any()) else near
 
     def pulses(self, cells: Tensor) -> Tensor:
-        """Transform cells about zero Doppler back to pulses, (trial, range, pulse)."""
+        """Transform cells around zero Doppler back to pulses, (trial, range, pulse)."""
         return torch.fft.ifft(_spread(cells, self.image.shape[-1]), norm="ortho")[..., : self.present.shape[-1]]
 
     def adjacent(self, cells: Tensor) -> tuple[Tensor, Tensor]:
-        """Products (trial, pulse - 1) of pulses with the conjugate of the pulse before, summed over
-        range, and powers of the pulse before.
+        """Products (trial, pulse - 1) of each pulse with the conjugate of the pulse before it,
+        summed over range, and powers of the pulse before.
 
-        The sums hold only the differences of Doppler within the window. Where it is narrow, they
-        are computed at fewer times than there are pulses and interpolated, which is exact.
+        As functions of slow time, the sums contain only the differences of Doppler within the
+        window. If the window is narrow, they are computed at fewer times than there are pulses and
+        interpolated, which is exact.
         """
         padded, reach = self.image.shape[-1], cells.shape[-1] // 2
         length = 1 << (4 * reach).bit_length()
@@ -407,9 +409,10 @@ class View:
         return products, powers.real
 
     def centred(self, cells: Tensor) -> Tensor:
-        """Pulses of cells with the interpolated peaks at zero Doppler, zero where one is missing.
+        """Pulses of the windowed cells with the interpolated peaks shifted to zero Doppler; absent
+        pulses are zero.
 
-        Kernels that are coherent over the aperture need the peaks to a fraction of a cell.
+        Kernels that are coherent over the aperture need the peaks to a fraction of a Doppler cell.
         """
         g, padded = self.pulses(cells), self.image.shape[-1]
         k = torch.arange(g.shape[-1], dtype=torch.float64, device=g.device)
@@ -421,23 +424,27 @@ class View:
 
 
 def _spread(cells: Tensor, n: int) -> Tensor:
-    """Cells (..., 2 reach + 1) about zero in FFT order, with zeros up to n."""
+    """Put cells (..., 2 reach + 1) around zero Doppler into FFT order, with zeros up to n cells."""
     reach = cells.shape[-1] // 2
     zeros = cells.new_zeros((*cells.shape[:-1], n - cells.shape[-1]))
     return torch.cat([cells[..., reach:], zeros, cells[..., :reach]], -1)
 
 
 def _lumv(view: View, cells: Tensor) -> Tensor:
-    """LUMV kernel: sum of Im(conj(g) dg) / sum |g|^2, with dg = g[k] - g[k - 1]."""
+    """Phases of the LUMV kernel: running sum of Im(conj(g) dg) / |g|^2, each summed over range,
+    with dg = g[k] - g[k - 1].
+    """
     products, before = view.adjacent(cells)
     step = products.imag / torch.where(before > 0, before, 1)
     return torch.cat([torch.zeros_like(step[..., :1]), step.cumsum(-1)], -1)
 
 
 def _coherent(view: View, cells: Tensor, unit: bool) -> Tensor:
-    """Phases of the first eigenvector of the sum over rows of g g^H, by six power steps.
+    """Phases of the eigenvector of the largest eigenvalue of the sum over rows of g g^H, by six
+    power steps.
 
-    With steps of unit modulus, the phases make the rows most coherent over the aperture.
+    With `unit`, the vector is reduced to unit modulus in each step. The phases then make the rows
+    most coherent over the aperture.
     """
     g = view.centred(cells)
     v = torch.ones_like(g[:, 0])
@@ -449,7 +456,8 @@ def _coherent(view: View, cells: Tensor, unit: bool) -> Tensor:
     return safe_angle(v)
 
 
-# phases (trial, pulse) by each kernel, from the image and its windowed cells
+# functions that return the phases (trial, pulse) of each kernel, given the image and its windowed
+# cells
 _KERNELS: dict[Kernel, Callable[[View, Tensor], Tensor]] = {
     "lumv": _lumv,
     "ml": lambda view, cells: running_sum(view.adjacent(cells)[0]),

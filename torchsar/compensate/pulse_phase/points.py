@@ -1,9 +1,9 @@
-"""Phases that make lines in Doppler of few points, by maximum likelihood.
+"""Maximum likelihood phases of scenes of few points.
 
-Each point that stays is a line in Doppler with a free amplitude in every range cell. Where a few
-lines and one phase per pulse explain the pulses down to the noise, the scene is known to stay, and
-the phases are as exact as noise permits. Sharpness alone is not: at 25 dB the phases of two to four
-points that sharpen the image were up to eight times as wrong.
+The echo of a point is a line in Doppler with a free amplitude in every range cell, as long as the
+point does not move by itself. Where a few lines and one phase per pulse explain the pulses down to
+the noise, no point moves, and the phases are as exact as noise permits. Phases that only sharpen
+the image are not: at 25 dB those of two to four points were up to eight times as wrong.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from torchsar.core import cis, host_value, power_of, true_positions
 def phases_of_points(rows: Tensor, present: Tensor, phase_rad: Tensor) -> tuple[Tensor, Tensor]:
     """Explain pulses by one phase per pulse and few lines in Doppler.
 
-    Lines are added one by one, each at the maximum of the spectrum of what is not explained, until
-    the rest is noise. With each number of lines, the amplitudes and the Dopplers are fitted in
-    turn, by least squares; and also the phases, as soon as lines explain most of the energy. A
-    target that turns bends the phases of its ranges against each other, by a square over the pulses
-    that grows with range; this bend is fitted too. The phases are those at the range where the
-    energy has its centre.
+    Lines are added one by one, each at the maximum of the spectrum of the residual, until the
+    residual is noise. With each number of lines, the amplitudes and the Dopplers are fitted in
+    turn, by least squares. The phases are fitted as well, as soon as lines explain most of the
+    energy. The rotation of a target adds a phase that is proportional to range and to the square of
+    slow time. This "bend" is fitted too. The phases are those at the range of the centroid of the
+    energy.
 
-    Trials are not explained if the energy has more than sixteen effective range cells, if they need
-    more than sixteen lines or one per eight pulses, or if the lines do not tell the phases because
-    nearly all energy has one range: phases can be found that make one point of it, and a single
-    point tells no change of its own phase from a phase error. Differentiable.
+    Trials are not explained if the energy has more than sixteen effective range cells, or if they
+    need more than sixteen lines or one per eight pulses. Nor are they if nearly all energy has one
+    range response. There are phases that focus such energy into one point, and changes of the phase
+    of a single point cannot be distinguished from phase errors. Differentiable.
 
     Args:
         rows: Pulses, shape (trial, range, pulse), complex.
@@ -43,24 +43,24 @@ def phases_of_points(rows: Tensor, present: Tensor, phase_rad: Tensor) -> tuple[
         per trial that is True where they do.
     """
     energy = power_of(rows.detach()).sum(-1)
-    # With energy in more than 16 effective range cells noise is as strong as points are, or they
-    # are many; with fewer than 32 pulses lines explain what is no point.
+    # With energy in more than 16 effective range cells, noise is as strong as the points, or there
+    # are many points. With fewer than 32 pulses, lines also explain echoes that are no points.
     open_ = (energy.sum(-1).square() < 16 * energy.square().sum(-1)) & (present.sum(-1) >= 32)
     phase, explained = phase_rad, torch.zeros_like(open_)
     at = true_positions(open_, host_value(open_.sum(), len(open_)))
     if not len(at):
         return phase, explained
     noise = noise_power(rows[at], present[at], phase[at])
-    # the least is that of data without noise, which the rounds do not explain any better
+    # lower limit for data without noise, below which the iterations do not reduce the residual
     noise = torch.maximum(noise, 1e-8 * energy[at].mean(-1).double() / rows.shape[-1])
     fit = _Fit.begin(rows[at], present[at], phase[at], noise)
     open_ = open_.index_copy(0, at, fit.cells > 0)
     for lines in range(1, 17):
         fit = fit.with_another_line()
-        # the level of the noise errs by a few percent
+        # the estimated level of the noise is wrong by a few percent
         found = (fit.rest() < 1.15) & fit.free & open_[at]
-        # energy of a second range, from the eigenvalues of the covariance over range, must tell the
-        # phases to 0.25 rad
+        # The energy of a second range response, which follows from the eigenvalues of the
+        # covariance over range, must determine the phases to 0.25 rad.
         good = found & (fit.of_second_range() < 0.25)
         phase = phase.index_copy(0, at, torch.where(good[:, None], phase_rad[at] + fit.change, phase[at]))
         explained = explained.index_copy(0, at, explained[at] | good)
@@ -113,7 +113,7 @@ class _Fit:
         pulses = present.sum(-1)
         power, strongest = power_of(rows).sum(-1).detach().sort(-1, descending=True)
         power, strongest = power[:, :32], strongest[:, :32]
-        # a range cell counts if its energy exceeds that of noise by five deviations
+        # a range cell is used if its energy exceeds that of noise by five standard deviations
         seen = power > (noise * (pulses + 5.0 * pulses.sqrt()))[:, None]
         cells = seen.sum(-1)
         most = max(1, host_value(cells.max(), strongest.shape[-1]))
@@ -142,11 +142,13 @@ class _Fit:
         below, peak, above = (power.gather(-1, (top + k) % n)[:, 0] for k in (-1, 0, 1))
         fall = 2 * peak - below - above
         place = top[:, 0] + torch.where(fall > 0, (above - below) / (2 * torch.where(fall > 0, fall, 1)), 0)
-        strongest = 2 * math.pi / n * place.to(change.dtype)  # in rad per pulse
+        # Doppler of the strongest line in rad per pulse
+        strongest = 2 * math.pi / n * place.to(change.dtype)
         lines = torch.cat([self.lines, strongest[:, None]], -1)
         pulses = self.present.sum(-1)
         pulse = _numbers(self.present, change.dtype)
-        # equal lines have an inverse by a share of the energy of a line
+        # with this small share of the energy of a line added, the matrix of equal lines is
+        # invertible
         ridge = 1e-6 * pulses[:, None, None] * torch.eye(lines.shape[-1], dtype=change.dtype, device=change.device)
         amplitudes = self.rows.new_zeros(*lines.shape, self.rows.shape[-2])
         active = torch.ones_like(free)
@@ -154,7 +156,8 @@ class _Fit:
             rows = rotate(self._straight(bend), change)
             waves = cis(lines[..., None] * pulse[:, None]) * self.present[:, None]
             matrix = waves.conj() @ waves.mT + ridge
-            # the ridge makes the matrix regular, so that no check must wait for the device
+            # the ridge keeps the matrix regular, so that the host need not wait for the device to
+            # check it
             solved = torch.linalg.solve_ex(matrix, waves.conj() @ rows.mT)[0]
             amplitudes = torch.where(active[:, None, None], solved, amplitudes)
             model = torch.where(active[:, None, None], (waves.mT @ amplitudes).mT, model)
@@ -173,9 +176,9 @@ class _Fit:
             if number % 3 == 0:
                 bent = self.curve * model
                 more = (bent.conj() * left).imag.sum((-2, -1)) / or_one(power_of(bent).sum((-2, -1)))
-                # The bend is pi / 8 times a wavelength over a cell, if cells are squares. With
-                # cells of 100 wavelengths, 0.004, the points of a target of 80 cells migrate by a
-                # fifth of a cell, and are no lines any more.
+                # If cells are squares, the bend is pi / 8 times the wavelength over the cell size:
+                # 0.004 for cells of 100 wavelengths. The points of a target of 80 cells then
+                # migrate by a fifth of a cell. With a larger bend they would no longer be lines.
                 bend = (bend + active * more).clamp(-0.004, 0.004)
             if number > 3:  # a round that moves the phases by less than 1e-3 rad rms is the last
                 active = active & (step.detach().square().sum(-1) > 1e-3**2 * pulses)
@@ -187,11 +190,13 @@ class _Fit:
         )
 
     def _straight(self, bend: Tensor) -> Tensor:
-        """Return the rows without a bend."""
+        """Return the rows after the quadratic phase `bend` is removed."""
         return self.rows * cis(-bend[:, None, None] * self.curve)
 
     def rest(self) -> Tensor:
-        """Power of what is not explained in powers of the noise, (trial,): 1 if it is all noise."""
+        """Power of the residual relative to that of the noise, (trial,); 1 if the residual is
+        noise.
+        """
         # a phase or a Doppler is half a complex parameter
         pulses, lines = self.present.sum(-1), self.lines.shape[-1]
         degrees = self.cells * (pulses - lines) - (pulses + lines) / 2
@@ -203,7 +208,7 @@ class _Fit:
         """
         amplitudes = self.amplitudes.to(torch.complex128)
         products = amplitudes @ amplitudes.mH
-        # elementary symmetric polynomials of the eigenvalues: their sum, and that of their products
+        # total: sum of the eigenvalues. pairs: twice the sum of the products of two eigenvalues.
         total = products.diagonal(dim1=-2, dim2=-1).real.sum(-1)
         pairs = total.square() - power_of(products).sum((-2, -1))
         known = pairs > 10 * torch.finfo(self.rows.dtype).eps * total.square()
@@ -211,7 +216,9 @@ class _Fit:
 
 
 def _numbers(present: Tensor, dtype: torch.dtype) -> Tensor:
-    """Number of each pulse less the middle one, 0 where there is none, (trial, pulse)."""
+    """Number of each pulse, counted from the middle one, and 0 for absent pulses, (trial,
+    pulse).
+    """
     return (torch.arange(present.shape[-1], dtype=dtype, device=present.device) - present.shape[-1] // 2) * present
 
 
@@ -229,7 +236,7 @@ def _turns(waves: Tensor, slopes: Tensor, matrix: Tensor, amplitudes: Tensor, le
     ridge = 1e-6 * size * torch.eye(curvature.shape[-1], dtype=size.dtype, device=size.device)
     right = (amplitudes.conj() * (slopes.conj() @ left.mT)).real.sum(-1, keepdim=True)
     turns = torch.linalg.solve_ex(curvature + ridge, right)[0][..., 0]
-    largest = 0.25 * 2 * math.pi / waves.shape[-1]  # a quarter of a cell
+    largest = 0.25 * 2 * math.pi / waves.shape[-1]  # a quarter of a Doppler cell
     return turns.clamp(-largest, largest)
 
 
@@ -252,11 +259,13 @@ def noise_power(rows: Tensor, present: Tensor, phase_rad: Tensor) -> Tensor:
     image = _windowed(torch.fft.fft(rotate(rows, phase_rad.detach()), norm="ortho"))
     power = torch.where((rows != 0).any(-1, keepdim=True), power_of(image), torch.nan)
     median = power.flatten(1).nanmedian(-1).values.nan_to_num(0.0).double()
-    # the window that the pulses had in the image
+    # effective window over the present pulses
     window = torch.fft.ifft(_windowed(torch.fft.fft(present.to(torch.complex128))))
     return median / (math.log(2) * or_one(window.real.square().mean(-1)))
 
 
 def _windowed(image: Tensor) -> Tensor:
-    """Image (..., Doppler) with the Hann window over its pulses and the same power of noise."""
+    """Apply a Hann window over the pulses to an image (..., Doppler), and keep the power
+    of noise.
+    """
     return (image - (image.roll(1, -1) + image.roll(-1, -1)) / 2) / math.sqrt(1.5)

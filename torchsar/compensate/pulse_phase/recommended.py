@@ -44,10 +44,10 @@ Scene = Literal["sparse", "points", "clutter", "auto"]
 # floor of the entropy fixed point in mean powers: a lower floor includes noise, a higher one
 # excludes weak scatterers
 _FLOOR = 2.5
-# on scenes at 30 dB, 3 of 32 trials of the entropy fixed point ended in a local minimum without
-# over-relaxation and none with this one
+# On scenes at 30 dB, 3 of 32 trials of the entropy fixed point ended in a local minimum without
+# over-relaxation, and none with this value.
 _RELAXATION = 1.8
-# iterations across gaps for each of the third step: filled pulses grow slowly
+# iterations across gaps for each iteration of the third step, because filled pulses converge slowly
 _FILLING = 5
 
 
@@ -160,9 +160,9 @@ def autofocus(
         return Run(Wiener(), imaging, count, factors, tolerance_rad)
 
     def find(rows: Tensor, present: Tensor, begin: Tensor | None) -> tuple[Tensor, Tensor]:
-        # Noise is weak where less than half of the range cells hold the energy. A low floor of the
-        # first iterations then ends in a wrong minimum in one scene of two hundred; in strong
-        # noise, a high floor hides the target.
+        # If less than half of the range cells hold the energy, noise is weak. A low floor of the
+        # first iterations then ends in a wrong minimum in one scene of two hundred. In strong
+        # noise, a high floor suppresses the target.
         energy = power_of(rows.detach()).sum(-1)
         tiny = torch.finfo(energy.dtype).tiny
         share = energy / energy.sum(-1, keepdim=True).clamp_min(tiny)
@@ -361,7 +361,9 @@ class EntropyFixedPoint(_PhaseEstimatorFromStart):
 
 
 def _filled(rows: Tensor, phase: Tensor, start: Tensor, gaps: Tensor, iterations: int, tolerance_rad: float) -> Tensor:
-    """Phases (trial, pulse): those across gaps, found from a start, where there are gaps."""
+    """Phases (trial, pulse), which in trials with gaps are those of `across_gaps` from the given
+    start.
+    """
     at = true_positions(gaps, host_value(gaps.sum(), len(gaps)))
     if not len(at):
         return phase
@@ -370,8 +372,8 @@ def _filled(rows: Tensor, phase: Tensor, start: Tensor, gaps: Tensor, iterations
 
 
 def _with_linked(pulses: Pulses, sharpest: Estimate, assess: bool) -> Estimate:
-    """The estimate with the linked phases where they make a homogeneous description likelier than
-    the sparse one of the sharpest phases.
+    """The sharpest estimate, with linked phases in those trials in which they make a homogeneous
+    description likelier than the sparse one.
     """
     rows, phase = pulses.rows.detach(), sharpest["phase_rad"].detach().reshape(-1, pulses.n)
     with torch.no_grad():
@@ -397,16 +399,20 @@ def _with_linked(pulses: Pulses, sharpest: Estimate, assess: bool) -> Estimate:
 
 
 def _with_slope(through: Through, runs: list[Run], rows: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
-    """Slope and phase with an image formation in which scatterers do not migrate.
+    """Find the phase, including its linear part (slope), for an image formation in which scatterers
+    do not migrate.
 
-    Finds the slope over one turn, the phase, the slope again, and the phase again.
+    A first search finds the slope over one turn per pulse; then phase and slope are found in turn.
+    Returns the phase and the number of iterations.
     """
     n = rows.shape[-1]
     ramp = torch.arange(n, dtype=phase.dtype, device=phase.device) - (n - 1) / 2
 
     @torch.no_grad()
     def best_slope(phase: Tensor, step_rad: float, count: int) -> Tensor:
-        """The phase plus the slope, of `count` about its own, that gives the least entropy."""
+        """The phase plus that linear phase, of `count` slopes around zero, of which the entropy is
+        least.
+        """
         best, least = phase, torch.full_like(phase[:, 0], torch.inf)
         for index in range(count):
             candidate = phase + (index - count // 2) * step_rad * ramp
@@ -415,7 +421,7 @@ def _with_slope(through: Through, runs: list[Run], rows: Tensor, phase: Tensor) 
             best, least = torch.where(better[:, None], candidate, best), torch.where(better, cost, least)
         return best
 
-    # 48 slopes over one turn per pulse, found by trial: spacing against time
+    # 48 slopes over one turn per pulse, a compromise between spacing and time, found by trial
     step = 2 * math.pi / 48
     phase, total = best_slope(phase, step, 48), torch.zeros_like(phase[:, 0], dtype=torch.int64)
     for _ in range(2):

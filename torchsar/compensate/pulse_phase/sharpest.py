@@ -33,7 +33,8 @@ from torchsar.optim import adam, lbfgs
 Cost = Callable[[Tensor], Tensor]
 Named = Literal["power_entropy", "amplitude_entropy", "contrast"]
 Method = Literal["lbfgs", "adam"]
-# phase (trial, pulse) -> cost (trial,), gradient (trial, pulse)
+# function of the phase (trial, pulse) that returns the cost (trial,) and its gradient (trial,
+# pulse)
 _PhaseCost = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
@@ -143,14 +144,14 @@ def sharpest_phase(
         weights, taken = descend(of_weights, _projected(own, first) / pulses.n)
         return _summed(own, weights), taken
 
-    # the start passed to `find` is the indices of the trials of a block, because masks, starts and
-    # basis functions may differ between trials
+    # The start that `find` receives holds the indices of the trials of a block, because masks,
+    # starts and basis functions may differ between trials.
     phase, taken = find_phases(pulses, find, torch.arange(len(pulses.rows), device=pulses.rows.device))
 
     def again(rows: Tensor, which: Tensor | slice, at: Tensor) -> Tensor:
-        """Continue without what the basis does not hold, with weights that follow from the cost.
+        """Continue within the span of the basis, with weights that follow from the cost.
 
-        With a higher floor of the entropy the iterations leave the minimum, with a lower one they
+        With a higher floor of the entropy the iterations leave the minimum. With a lower one they
         hardly move in noise.
         """
         weights = (lambda power, mean: power / mean) if objective == "contrast" else LogAbove(1.0)
@@ -186,23 +187,24 @@ class SharpestPhase(_PhaseEstimatorFromStart):
 
 
 def _summed(functions: Tensor, x: Tensor) -> Tensor:
-    """Sums (trial, pulse) of functions (coordinate, pulse) or (trial, coordinate, pulse)."""
+    """Sum (trial, pulse) of functions (coordinate, pulse) or (trial, coordinate, pulse) with the
+    weights x.
+    """
     return (x[..., None, :] @ functions)[..., 0, :]
 
 
 def _projected(functions: Tensor, gradient: Tensor) -> Tensor:
-    """Gradient (trial, coordinate) by the weights of functions from that by phases."""
+    """Gradient (trial, coordinate) by the weights of functions, from the gradient by the phases."""
     return (functions @ gradient[..., None])[..., 0]
 
 
 def _of_trials(x: Tensor | None, which: Tensor | slice) -> Tensor | None:
-    """Some of the trials of x, if it has a dimension of trials before two others."""
+    """Select trials of x, if it has a dimension of trials before two others."""
     return x if x is None or x.ndim < 3 else x[which]
 
 
 def _functions_of(basis: Tensor | None, pulses: Pulses) -> Tensor | None:
-    """Functions of a basis that are orthogonal over the pulses and have unit mean square.
-
+    """Orthogonalise the functions of a basis over the pulses, and scale them to unit mean square.
     Raises ValueError if the basis is invalid.
     """
     if basis is None:
@@ -223,7 +225,7 @@ def _functions_of(basis: Tensor | None, pulses: Pulses) -> Tensor | None:
 
 
 def _by_trial(x: Tensor, pulses: Pulses, what: str) -> Tensor:
-    """x (..., a, b) as (trial, a, b); of the same shape if it has two dimensions or fewer."""
+    """Reshape x (..., a, b) to (trial, a, b). With two dimensions or fewer it keeps its shape."""
     if not isinstance(x, Tensor):
         raise TypeError(f"sharpest_phase: {what} must be a tensor, got {type(x).__name__}; torch.as_tensor makes one")
     try:
@@ -240,9 +242,8 @@ def _by_trial(x: Tensor, pulses: Pulses, what: str) -> Tensor:
 def _cost_of(
     objective: Named | Cost, mask: Tensor | None, imaging: Imaging | None, pulses: Pulses
 ) -> Callable[[Tensor, Tensor], _PhaseCost]:
-    """Function of (rows, which trials) that returns the cost of their phases.
-
-    Raises ValueError if the objective is unknown or does not use the mask.
+    """Function of (rows, indices of their trials) that returns the cost of their phases. Raises
+    ValueError if the objective is unknown or does not use the mask.
     """
     if isinstance(objective, str) and objective not in get_args(Named):
         raise ValueError(
@@ -271,14 +272,16 @@ def _cost_of(
 
 
 def _centred_image(rows: Tensor) -> Tensor:
-    """Image (trial, azimuth, range) of rows (trial, range, pulse) as by `azimuth_transform`."""
+    """Image (trial, azimuth, range) of rows (trial, range, pulse), as `azimuth_transform`
+    forms it.
+    """
     return (centred_ifft(rows) * math.sqrt(rows.shape[-1])).mT
 
 
 def _derived(
     rows: Tensor, image: Callable[[Tensor], Tensor], of_image: Cost, phase_rad: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Any cost of the image, with its gradient by automatic differentiation."""
+    """Cost of the image by any function, with its gradient by automatic differentiation."""
     with torch.enable_grad():
         phase = phase_rad.detach().requires_grad_()
         cost = of_image(image(rotate(rows, phase)))

@@ -24,9 +24,9 @@ def sharpness_beyond_speckle(image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         image: Image, shape (..., range, Doppler), complex.
 
     Returns:
-        The sharpness in nats; the effective number of rows over which the energy is spread,
-        :math:`1 / \sum s_n^2`; and that over which the sharpness is spread (1 if one bright row
-        makes all of it); shape (...,) each, float64.
+        The sharpness in nats. The effective number of rows over which the energy is spread,
+        :math:`1 / \sum s_n^2`. And that over which the sharpness is spread (1 if one bright row
+        makes all of it). Shape (...,) each, float64.
     """
     real, imag = image.real.contiguous(), image.imag.contiguous()
     power = torch.addcmul(real * real, imag, imag)
@@ -36,8 +36,8 @@ def sharpness_beyond_speckle(image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     entropy = torch.log(row.clamp_min(tiny)) - (power * torch.log(power.clamp_min(tiny))).sum(-1) / or_one(row)
     row, entropy = row.to(torch.float64), entropy.to(torch.float64)
     share = row / or_one(row.sum(-1, keepdim=True))
-    # that of speckle, whose power has an exponential distribution, is 1 - Euler's constant below
-    # that of a uniform row
+    # The entropy of speckle, whose power has an exponential distribution, is 1 - Euler's constant
+    # below that of a uniform row.
     speckle = math.log(image.shape[-1]) - (1 - 0.5772156649015329)
     lack = share * torch.where(row > 0, speckle - entropy, 0)
     sharp = lack.sum(-1)

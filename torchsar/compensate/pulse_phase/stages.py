@@ -72,7 +72,7 @@ class CorrectPulsePhase(Stage):
 
 
 class _PhaseEstimator(Stage):
-    """An estimator of the phase of every pulse, by a function with options."""
+    """Base of stages that estimate the phase of every pulse by a function with options."""
 
     provides = ("phase_rad",)
     neutral = {"phase_rad": 0.0}
@@ -92,7 +92,7 @@ class _PhaseEstimator(Stage):
 
 
 class _PhaseEstimatorFromStart(_PhaseEstimator):
-    """An estimator that can start from a phase."""
+    """Base of those stages that can start from a phase."""
 
     def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
         """Estimate the phase error of every pulse of a signal of axes (pulse, range).

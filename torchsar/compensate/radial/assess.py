@@ -26,15 +26,17 @@ LEAST_PERIODS = 8
 def assessed_velocity(found: Estimate, measured: Measured, pulse: Axis) -> Estimate:
     """Add standard deviation and outcome to an estimate of radial velocities.
 
-    Noise, and the interference of scatterers of random phases, disturb the power of the echo as
-    much as its phase, and independently: for a complex amplitude s that changes by ds, the real and
-    the imaginary part of conj(s) ds have equal variances. Motion changes the phase only. The
-    changes of power between both sweeps, taken as changes of phase, therefore show the deviation,
-    whatever the scene. Added are the effect of jerk and the error of interpolation in periods
-    without a clear echo. The deviation of a method that does not use the product of up and mirrored
-    down sweeps is also no less than the difference from the velocities of that product, less their
-    own deviation: the scatterer that it follows may have another velocity than the scene, and
-    where scatterers have equal phases, their interference changes the power less than the phase.
+    Noise, and the interference of scatterers of random phases, change the power of the echo as much
+    as its phase, and independently. If a complex amplitude s changes by ds, the real and the
+    imaginary part of conj(s) ds have equal variances. Motion changes the phase only. The relative
+    changes of power between both sweeps therefore have the same variance as the phase errors,
+    whatever the scene. The effect of jerk is added, and the error of interpolation in periods
+    without a clear echo.
+
+    A method that does not use the product of up and mirrored down sweeps may follow one scatterer,
+    which may have another velocity than the scene. If scatterers have equal phases, their
+    interference changes the power less than the phase. The deviation of such a method is therefore
+    at least the difference from the velocities of that product, less their own deviation.
 
     Args:
         found: Estimate of the velocities.
@@ -58,12 +60,13 @@ def assessed_velocity(found: Estimate, measured: Measured, pulse: Axis) -> Estim
     highest = torch.fft.fft(measured.still, 2 * m).abs().amax(-1).to(torch.float64) / m
     best = Levels.of(highest, product)
     elsewhere = mean_of((highest > 1.1 * measured.common).to(torch.float64), lit)[..., 0]
-    # a velocity is of no use from 0.07 bins on; noise alone gives 0.05 where the SNR is just enough
+    # A velocity with an error of 0.07 bins or more is of no use. Noise alone gives 0.05 at the
+    # lowest sufficient SNR.
     useless = mean_of(square, product.lit)[..., 0] >= (0.07 * bin_m_s) ** 2
     outcome = worst(
         (Outcome.INEXACT, ~measured.enough | useless),
         (Outcome.AMBIGUOUS, (best.squared >= LEAST_SQUARED) & (elsewhere > 0.05)),
-        # noise alone may make the peak of the product of both sweeps below 9 dB, by trial
+        # below 9 dB, noise alone may cause the peak of the product of both sweeps, by trial
         (Outcome.NOISE, ~lit.any(-1) | (~measured.enough & (best.squared < 10**0.9))),
         (Outcome.EMPTY, (measured.common == 0).all(-1)),
     )
@@ -78,16 +81,18 @@ def _variance(measured: Measured, pulse: Axis) -> Tensor:
     weight = mean_of(share, clear).clamp_min(TINY)
 
     def variance(changes: Tensor) -> Tensor:
-        # a constant part is that of the detector or of the laser: sweeps that differ in power
+        # A constant part is removed, because it comes from the detector or the laser, whose sweeps
+        # differ in power.
         changes = changes - mean_of(changes * share, clear) / weight
-        # the deviation that white noise explains counts as that of four periods
+        # the variance that white noise explains has the weight of four periods
         counted = count * mean_of(changes.square() * share, clear) + 4 * white
         return counted / ((count - 1).clamp_min(0) + 4)
 
     changes = _changes_of_product(measured, law.intercept or "free") if law.changes is None else law.changes()
     square = filled(variance(changes) / share, clear)
     slope, bend = (_rms_difference(measured.raw_m_s, clear, order) for order in (1, 2))
-    # 1 / 32: mean square of the time between two samples of a product over 24 squared periods
+    # The factor 1 / 32 is the mean square of the time between two samples of a product, divided by
+    # 24 squared periods.
     jerk = bend / 32 * (measured.product.radar.period_s / pulse.step) ** 2
     square = square + _interpolated(clear, slope, bend).square() + jerk.square() + law.floor_m_s**2
     if law.intercept:
@@ -102,7 +107,9 @@ def _variance(measured: Measured, pulse: Axis) -> Tensor:
 
 
 def _changes_of_product(measured: Measured, intercept: Intercept) -> Tensor:
-    """Velocities (..., pulse) in m/s that the changes of power give, taken as changes of phase."""
+    """Velocities (..., pulse) in m/s that follow if relative changes of power are taken as changes
+    of phase.
+    """
     bands = measured.product
     inner, radar = bands.inner, bands.radar
     per_s = 4 * math.pi * radar.carrier_hz / radar.wave_speed_m_s
@@ -123,12 +130,14 @@ def _changes_of_product(measured: Measured, intercept: Intercept) -> Tensor:
 
 
 def _quotient(a: Tensor, b: Tensor) -> Tensor:
-    """a / b in float64, zero where b is not positive."""
+    """Quotient a / b in float64, zero where b is not positive."""
     return torch.where(b > 0, a / torch.where(b > 0, b, 1), 0).to(torch.float64)
 
 
 def _rms_difference(velocity: Tensor, known: Tensor, order: int) -> Tensor:
-    """Rms first or second difference of velocities (..., pulse) in known periods, (..., 1)."""
+    """Rms first or second difference (order 1 or 2) of velocities (..., pulse) in known periods,
+    (..., 1).
+    """
     if velocity.shape[-1] <= order:
         return torch.zeros_like(velocity[..., :1])
     return mean_of(velocity.diff(n=order).square(), known.unfold(-1, order + 1, 1).all(-1)).sqrt()
@@ -150,9 +159,9 @@ def _interpolated(known: Tensor, slope: Tensor, bend: Tensor) -> Tensor:
 def assessed_motion(found: Estimate, cells: Tensor, walk: Walk) -> Estimate:
     """Add standard deviation and outcome of the phases to an estimate of the radial motion.
 
-    In a dense scene, they are those of `linked_walk`. In other scenes noise gives the deviation,
-    and where the power of the pulses is modulated, because several scatterers interfere, also the
-    difference from the phases of least entropy.
+    In a dense scene they are those of `linked_walk`. In other scenes noise gives the deviation. If
+    the power of the pulses is modulated, because several scatterers interfere, the difference from
+    the phases of least entropy is added.
 
     Args:
         found: Estimate whose velocities were assessed.
@@ -173,10 +182,10 @@ def assessed_motion(found: Estimate, cells: Tensor, walk: Walk) -> Estimate:
     n, lines = cells.shape[-2], cells.reshape(-1, *cells.shape[-2:])
     lit, range_cells = found.info["lit"].reshape(-1, n), found.info["range_cells"].flatten()
     power = power_of(lines).sum(-1, dtype=torch.float64)
-    # standard deviation over mean of the power of the lit pulses
+    # standard deviation of the power of the lit pulses, over its mean
     modulation = mean_of((power / mean_of(power, lit).clamp_min(TINY) - 1).square(), lit)[:, 0].sqrt()
-    # a relative modulation of the power of 0.1, besides four standard deviations of noise, shows
-    # several scatterers; it is measured from 32 periods on
+    # A relative modulation of the power of 0.1 beyond four standard deviations of noise means
+    # several scatterers. It is measured in records of 32 periods or more.
     modulated = (modulation > 0.1 + 4 * math.sqrt(2) * walk.std_rad[:, 0]) & (n >= 32)
     sparse = walk.apart_rad.isnan()
     one_cell = modulated & sparse & (range_cells < 1.5)
@@ -186,14 +195,15 @@ def assessed_motion(found: Estimate, cells: Tensor, walk: Walk) -> Estimate:
     if count:
         at = true_positions(compared, count)
         pulses = prepare(lines[at], "radial_motion")
-        sharpen = Run(LogAbove(2.5), AlongPulses(), 60, 1.8, 0.01)  # least entropy, as in `autofocus`
+        # iterations towards least entropy, as in `autofocus`
+        sharpen = Run(LogAbove(2.5), AlongPulses(), 60, 1.8, 0.01)
         other = fixed_point(pulses.rows, pair_phase(pulses.rows, pulses.present), sharpen)[0]
         apart = apart.index_put((at,), 2 * phase_rmse(walk.phase_rad[at], other, lit[at]))
         std = (std.square() + apart[:, None].square()).sqrt()
     reasons = worst(
         (Outcome.INEXACT, mean_of(std.square(), lit)[:, 0] >= 0.5**2),
-        # twice the rms difference of least entropy from right phases was 0.11 to 0.15 rad, and 0.43
-        # and more where both were wrong at -10 dB
+        # Twice the rms difference between the phases of least entropy and correct phases was 0.11
+        # to 0.15 rad. It was 0.43 and more where both were wrong at -10 dB.
         (Outcome.AMBIGUOUS, (walk.apart_rad >= SAME_RAD) | (apart >= 0.35)),
         (Outcome.TOO_FEW, one_cell | ((lines != 0).any(-1).sum(-1) < LEAST_PERIODS)),
     )

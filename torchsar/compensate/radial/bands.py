@@ -16,8 +16,8 @@ from torchsar.core import Axis, checked_samples, cis, level_of, power_of, real_d
 from torchsar.radar import TriangularLadar
 
 SWEEPS = ("ramp", "pulse", "fast_time")  # axes of the signals of the stages
-# periods over which envelopes are averaged, found by trial: more raise the SNR, fewer follow
-# vibration
+# periods over which envelopes are averaged, found by trial: more of them raise the SNR, fewer
+# follow vibration
 _BLOCK = 8
 
 
@@ -207,7 +207,7 @@ def bulk_shift(blocks: Tensor, pulses: int) -> tuple[Tensor, Tensor]:
     n = blocks.shape[-1]
     blocks = torch.stack([blocks[..., 0, :, :], blocks[..., 1, :, :].roll(-1, -1).flip(-1)], -3)
     likeness, lag = _best_lag(torch.fft.fftshift(blocks, dim=-1), 2 * n)
-    alike = likeness > 0.35  # by trial: noise alone does not reach it
+    alike = likeness > 0.35  # by trial; the likeness of noise alone does not reach it
     lag = filled(_median_of_three(filled(lag.to(torch.float64), alike)), alike)
     shift = torch.round(_through_blocks(lag, pulses) / 2).to(torch.int64)
     return shift, alike.repeat_interleave(_BLOCK, -1)[..., :pulses]
@@ -216,7 +216,7 @@ def bulk_shift(blocks: Tensor, pulses: int) -> tuple[Tensor, Tensor]:
 def _best_lag(power: Tensor, length: int) -> tuple[Tensor, Tensor]:
     """Greatest correlation coefficient of up and mirrored down spectra, and its lag, (..., pulse).
 
-    power: (..., 2, pulse, bin); length: of the circular correlation.
+    power: (..., 2, pulse, bin). length: number of samples of the circular correlation.
     """
     power = power - power.mean(-1, keepdim=True)
     level = power.square().sum(-1, keepdim=True).clamp_min(torch.finfo(power.dtype).tiny).sqrt()
@@ -256,7 +256,7 @@ def _median_of_three(x: Tensor) -> Tensor:
 
 
 def _through_blocks(values: Tensor, pulses: int) -> Tensor:
-    """Values (..., block) at the middles of blocks, interpolated linearly to (..., pulse).
+    """Interpolate values (..., block) at the middles of blocks linearly to (..., pulse).
 
     The first and the last straight line are continued to the ends.
     """
@@ -303,7 +303,7 @@ class Spectra:
             The spectra.
         """
         middle = sweeps.shape[-1] // 2
-        # a power of two: squares then neither underflow nor overflow
+        # with a power of two as scale, squares neither underflow nor overflow
         scale = 1 / level_of(sweeps.detach()[..., middle - 4 : middle + 4], 3)
         spectrum = torch.fft.fft(sweeps.conj() if radar.dechirp_sign == "echo_conj_lo" else sweeps)
         # with a rectangular window, a peak between two bins would lose more than half of its power
@@ -359,7 +359,7 @@ class Spectra:
         turned = cis((math.pi * middle * ((n - 1) / n) % (2 * math.pi)).to(real_dtype(kept.dtype)))
         series = torch.fft.ifft(kept * filters[:, None, :] * (turned * self.scale[..., 0])[..., None], m) * (m / n)
         index = torch.arange(m, dtype=torch.float64, device=device) - (m - 1) / 2
-        # exp(2j pi first u / T), so that bins count from zero beat again
+        # the factor exp(2j pi first u / T) makes bins count from zero beat frequency again
         series = series * torch.exp(2j * math.pi * ((first * index / m) % 1)).to(series.dtype)
         up, down = series[..., 0, :, :], series[..., 1, :, :]
         # a period without an echo has much less energy in the window than usual, by trial
@@ -374,25 +374,26 @@ class Spectra:
             self.alike & (certain | ~faint),
             lines,
             first,
-            # computed on the host, for which the device need not be read
+            # computed on the host, so that no value need be read from the device
             float(_raised_cosine(torch.arange(lines, dtype=torch.float64), lines, edges).square().sum()),
             radar,
         )
 
 
 def _corrected_shift(smooth: Tensor, shift: Tensor, first: int, lines: int) -> tuple[Tensor, Tensor]:
-    """The shift of every period, corrected by its own envelopes, and where it is certain.
+    """The shift of every period, corrected by the envelopes of that period alone, and where it is
+    certain.
 
-    It is corrected where the envelopes are similar and their lag is two bins or more. Eight periods
-    together have a higher SNR; one period alone follows a vibration of a few periods. A single
-    period that differs from both neighbours by three bins or more takes the shift of one of them: a
-    scatterer that enters the beam between its two sweeps is seen in one of them only. The search
-    for the velocity reaches further than that.
+    It is corrected where the envelopes of both sweeps are similar and their lag is two bins or
+    more. Eight periods together have a higher SNR, but one period alone follows a vibration of a
+    few periods. A scatterer that enters the beam between the two sweeps of a period is seen in one
+    of them only. Therefore a single period whose shift differs from both neighbours by three bins
+    or more takes the shift of one of them; the search for the velocity reaches further than that.
     """
     power = power_of(_in_window(smooth, shift, first, lines))
     likeness, lag = _best_lag(power, 2 ** math.ceil(math.log2(2 * lines)))
-    # by trial: envelopes so similar overrule those of the neighbouring periods; a lag beyond 14
-    # bins is that to another scatterer, illuminated in one sweep only
+    # By trial. Envelopes this similar overrule those of the neighbouring periods. A lag beyond 14
+    # bins is the distance to another scatterer, illuminated in one sweep only.
     certain = (likeness > 0.7) & (lag.abs() <= 14)
     own = shift + torch.where(certain & (lag.abs() >= 2), torch.round(lag / 2).to(torch.int64), 0)
     typical = _median_of_three(own)

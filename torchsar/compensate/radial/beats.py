@@ -240,7 +240,9 @@ def from_beats(up_hz: Tensor, down_hz: Tensor, bands: Bands) -> Tensor:
 
 @torch.no_grad()
 def _amplitude_slope(x: Tensor, beat_hz: Tensor, bands: Bands) -> Tensor:
-    """Slope in Hz (..., pulse) of the amplitude of a tone, taken as a phase."""
+    """Slope in Hz (..., pulse) that follows if the relative slope of the amplitude of a tone is
+    taken as one of the phase.
+    """
     u = bands.time_s
     tone = x * cis((-2 * math.pi * beat_hz[..., None] * u).to(x.real.dtype))
     level = tone.mean(-1)
@@ -283,11 +285,12 @@ def peak_frequencies(bands: Bands, window_m: tuple[float, float] | None) -> tupl
     searched = inside(bands.radar, window_m, n, 2, both.device)
     centre = torch.where(searched, power.mean((-3, -2), keepdim=True), -1).argmax(-1, keepdim=True)
     distance = (torch.arange(n, device=both.device) - centre + n // 2) % (n) - n // 2
-    # within two range cells about the peak of the whole record
+    # the search is within two range cells of the peak of the whole record
     peak, best = torch.where(distance.abs() <= 4, power, -1).max(-1)
     best = torch.where(best >= n // 2, best - n, best)
     frequency = best.to(torch.float64) / (2 * bands.radar.sweep_s)
-    frequency = climbed(both, bands.radar.sweep_s / m, frequency, 3)  # steps, by trial enough to converge
+    # three Newton steps, enough to converge by trial
+    frequency = climbed(both, bands.radar.sweep_s / m, frequency, 3)
     return frequency[..., 0, :], frequency[..., 1, :], shining(peak[..., 0, :], peak[..., 1, :])
 
 

@@ -1,4 +1,4 @@
-"""Estimators of radial velocities as stages and functions of many trials.
+"""Estimators of radial velocities as stages, and as functions that process many trials.
 
 A block of trials fits into the cache.
 """
@@ -99,8 +99,8 @@ def by_trials(
             f"azimuth_m must be one number (m) or one per trial {tuple(trials)}, got shape {tuple(azimuth.shape)}"
         )
     refuse_non_finite(azimuth, "azimuth_m")
-    # 16 times the size that is best for one operation, found by trial: smaller blocks cost more in
-    # calls than they gain in the cache
+    # 16 times the size that is best for one operation, found by trial; with smaller blocks the
+    # calls cost more than the cache saves
     height = max(1, 16 * block_bytes_of(sweeps.device) // (sweeps.shape[-3:].numel() * sweeps.element_size()))
     count = trials.numel()
     if count <= height or (torch.is_grad_enabled() and (sweeps.requires_grad or azimuth.requires_grad)):
@@ -118,7 +118,7 @@ def by_trials(
 
 
 class _SweepEstimator(Stage):
-    """An estimator of the radial velocity from both sweeps of a range window.
+    """Base of the stages that estimate the radial velocity from both sweeps of a range window.
 
     Args:
         radar: Ladar parameters.

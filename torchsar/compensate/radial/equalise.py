@@ -19,8 +19,8 @@ from torchsar.core import (
     refuse_non_finite_values,
 )
 
-LEAST_GAIN = 0.05  # least gain of a pulse: a lost pulse is not amplified more than 20 times
-_PAD = 4  # zero-padding of the transform: a peak is then found to an eighth of a cell
+LEAST_GAIN = 0.05  # least gain of a pulse, so that a lost pulse is not amplified more than 20 times
+_PAD = 4  # zero-padding of the transform, with which a peak is found to an eighth of a cell
 
 
 def pulse_gain(data: Tensor, *, assess: bool = True) -> Estimate:

@@ -16,9 +16,11 @@ from torchsar.core import Axis, Estimate, cis, power_of
 
 Intercept = Literal["known", "record", "free"]
 TINY = torch.finfo(torch.float64).tiny
-# SNR after compression, 16 dB, from which on the peaks of single sweeps exceed the noise: measured
-# 1 slip in 1000 periods at 13 dB, none from 14 dB on; the measured SNR errs by a decibel or two.
-# The same for a product of sweeps, after the squaring loss, 15 dB, found by trial
+# _LEAST_SNR: SNR after compression, 16 dB, from which on the peaks of single sweeps exceed the
+# noise. In 1000 periods, one slip was measured at 13 dB, and none from 14 dB on. The measured SNR
+# is wrong by a decibel or two.
+# LEAST_SQUARED: the same limit for a product of sweeps, after the squaring loss, 15 dB, found by
+# trial.
 _LEAST_SNR, LEAST_SQUARED = 10**1.6, 10**1.5
 
 
@@ -71,8 +73,8 @@ class Levels(NamedTuple):
         """
         up, down = (power_of(x.detach()[..., bands.inner]).mean(-1).to(torch.float64) for x in (bands.up, bands.down))
         shared, total = (mean_of(x, bands.lit)[..., 0] for x in (common, (up + down) / 2))
-        # the magnitude of a mean of noise is not zero: up to 1.5 times what noise alone would give
-        # is no scene
+        # The magnitude of a mean of noise is not zero. Up to 1.5 times what noise alone would give
+        # does not count as scene.
         chance = total / math.sqrt(min(len(bands.time_s[bands.inner]), 2 * bands.noise_lines))
         scene = torch.where(shared > 1.5 * chance, shared, 0).clamp_max(total)
         ratio = _ratio(scene, total - scene)
@@ -82,7 +84,8 @@ class Levels(NamedTuple):
 
 @dataclass(frozen=True)
 class Measured:
-    """Radial velocities that a method measured, and what the sweeps show at these velocities.
+    """Radial velocities that a method measured, and the echo and noise of the sweeps at these
+    velocities.
 
     Args:
         velocity_m_s: Velocities at the turning points (ends of the up sweeps) in m/s, shape
@@ -125,7 +128,7 @@ class Measured:
         finite = torch.isfinite(velocity_m_s.detach())
         lit = (product.lit if lit is None else product.lit & lit) & finite
         raw = filled(torch.where(finite, velocity_m_s, 0), lit)
-        # the product of up and mirrored down sweeps without the phase of the velocities
+        # product of the up and the mirrored down sweeps, with the phase of the velocities removed
         inner, radar = product.inner, product.radar
         up, down = product.up.detach()[..., inner], product.down.detach()[..., inner]
         turns = 4 * radar.carrier_hz / radar.wave_speed_m_s * (raw.detach() - product.shift_m_s)
@@ -135,15 +138,17 @@ class Measured:
         levels = Levels.of(common, product)
         counted = lit | ~lit.any(-1, keepdim=True)
         own = _ratio(common, levels.noise[..., None])
-        # a period has faded below 12 dB, where noise may exceed its peak, and below a twentieth of
-        # the mean power, where interference spoils the phase
+        # An echo is clear unless it is below 12 dB, where noise may exceed its peak, or below a
+        # twentieth of the mean power, where interference disturbs the phase.
         clear = common > 0.05 * mean_of(common, counted)
         clear = lit & clear & (own * product.noise_lines / (1 + 1 / (2 * own)) >= 10**1.2)
         return Measured(filled(raw, clear), raw, product, still, common, levels, lit, clear, law, info)
 
     @property
     def enough(self) -> Tensor:
-        """Whether the SNR suffices for peaks that exceed the noise in all periods, shape (...,)."""
+        """True where the SNR suffices for peaks that exceed the noise in all periods,
+        shape (...,).
+        """
         return self.levels.squared >= LEAST_SQUARED if self.law.intercept else self.levels.after >= _LEAST_SNR
 
     @property
@@ -163,9 +168,9 @@ class Measured:
             `velocity_m_s` without the geometric velocity. `quality` is the share of the power in
             the window that both sweeps have in common. `info` holds "snr_db", the SNR after
             compression, and "noise_m_s", the standard deviation that is due to noise, shape (...,)
-            each; "shift", the Doppler shift removed from the sweeps in whole bins, and "lit",
-            False for periods in which no scatterer is illuminated, shape (..., pulse) each; and
-            the entries of the method.
+            each. It also holds "shift", the Doppler shift removed from the sweeps in whole bins,
+            and "lit", False for periods in which no scatterer is illuminated, shape (..., pulse)
+            each. The entries of the method are added.
         """
         bands = self.product
         centre = (bands.first + bands.lines / 2) * bands.radar.range_step_m
@@ -181,7 +186,7 @@ class Measured:
 
 
 def mean_of(x: Tensor, counted: Tensor) -> Tensor:
-    """Compute the mean over the periods that count.
+    """Compute the mean over the periods that are counted.
 
     Args:
         x: Values, shape (..., pulse).
@@ -194,5 +199,5 @@ def mean_of(x: Tensor, counted: Tensor) -> Tensor:
 
 
 def _ratio(signal: Tensor, noise: Tensor) -> Tensor:
-    """Signal over noise within the limits of numbers."""
+    """Ratio of signal to noise, between 1e-6 and 1e18."""
     return (signal / noise.clamp_min(TINY)).clamp(1e-6, 1e18)

@@ -1,11 +1,11 @@
 """Residual phase of each pulse after the motion was compensated by integrated velocities.
 
 The error of integrated velocities grows over the record; the error of the phases estimated here
-does not. Phases that sharpen the image are right where scatterers are few. Where many scatterers in
-a range cell interfere, sharpness prefers wrong phases. There the phases of greatest likelihood are
-the right ones, but a search that starts too far away ends in a local maximum. It is therefore
-started from the phases that sharpen the image and from a smooth walk, and if the results differ it
-is also made without a start. Only a result that was reached twice is reliable.
+does not. Phases that sharpen the image are correct where scatterers are few. Where many scatterers
+in a range cell interfere, the sharpest image has wrong phases. The phases of greatest likelihood
+are then correct, but a search that starts too far away ends in a local maximum. It is therefore
+started from the phases that sharpen the image and from a smooth walk. If the results differ, it is
+also made without a start. Only a result that was reached twice is reliable.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from torchsar.core.spline import Spline
 from torchsar.metrics.phase import phase_rmse
 from torchsar.optim import adam
 
-# found by trial: higher levels exclude weak scatterers, lower ones include noise
+# found by trial: a higher level excludes weak scatterers, a lower one includes noise
 _SCENE = Wiener(level=4.0, share=0.02)
 
 
@@ -111,7 +111,7 @@ def phase_polish(
 
 
 def sharpened(rows: Tensor, start: Tensor | None, iterations: int, tolerance_rad: float) -> tuple[Tensor, Tensor]:
-    """Estimate the phases as `phase_polish` does, without a verdict.
+    """Estimate the phases as `phase_polish` does, without assessment.
 
     Args:
         rows: Range cells over the pulses, shape (trial, range, pulse), complex.
@@ -129,8 +129,8 @@ def sharpened(rows: Tensor, start: Tensor | None, iterations: int, tolerance_rad
 def _runs(iterations: int, tolerance_rad: float) -> list[Run]:
     """The iterations with Wiener weights, and the last ones, on twice as many Doppler cells.
 
-    Over-relaxation by 1.7, found by trial: larger values converge faster, at 2 or more need not
-    converge.
+    Over-relaxation by 1.7 was found by trial. Larger values converge faster, but with 2 or more the
+    iterations need not converge.
     """
     last = Run(_near_peak, AlongPulses(2), 5, 1.0, tolerance_rad / 2)
     return [Run(_SCENE, AlongPulses(), iterations, 1.7, tolerance_rad), last]
@@ -161,7 +161,8 @@ def scene_cells(rows: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _single_points(power: Tensor, mean: Tensor) -> Tensor:
-    """Power over the maximum of the range cell, for trials of few scatterers; else as `_SCENE`.
+    """Weights of image cells. In trials of few scatterers it is the power over the maximum of the
+    range cell, in others the weight of `_SCENE`.
 
     Trials of few scatterers are those whose typical bright cell is within 3 dB of the brightest.
     """
@@ -171,7 +172,9 @@ def _single_points(power: Tensor, mean: Tensor) -> Tensor:
 
 
 def _near_peak(power: Tensor, mean: Tensor) -> Tensor:
-    """Weights near one within 10 dB of the strongest cell of a range cell, falling below."""
+    """Weights near one for cells within 10 dB of the strongest one of their range cell, and smaller
+    ones for weaker cells.
+    """
     peak = power.amax(-1, keepdim=True)
     return power / torch.where(peak > 0, power + 0.1 * peak, 1)
 
@@ -205,7 +208,7 @@ class PhasePolish(Stage):
         return phase_polish(signal.data, **self.options)
 
 
-SAME_RAD = 0.1  # rms difference below which two results are the same
+SAME_RAD = 0.1  # rms difference in rad below which two results count as the same
 
 
 class Walk(NamedTuple):
@@ -238,8 +241,8 @@ def linked_walk(cells: Tensor, polished_rad: Tensor, step_rad: Tensor) -> Walk:
         The most likely of the phases from two or three starts.
     """
     n = cells.shape[-2]
-    # Pulses are averaged to about 128 blocks, over which the residual phase is smooth; it makes the
-    # search fast, because its time grows with the cube of their number.
+    # Pulses are averaged to about 128 blocks, over which the residual phase is smooth. This makes
+    # the search fast, because its time grows with the cube of their number.
     size = max(1, n // 128)
     count = n // size
     first = (n - count * size) // 2
@@ -262,10 +265,10 @@ def linked_walk(cells: Tensor, polished_rad: Tensor, step_rad: Tensor) -> Walk:
     trial = torch.arange(len(best), device=best.device)
     chosen = phase[best, trial]
     apart = phase_rmse(phase, chosen).index_put((best, trial), torch.full_like(gain[0], torch.inf)).amin(0)
-    # variance of a random walk about a spline through the means of blocks of n steps, over n times
-    # that of a step: .115, simulated for n = 2 to 16
+    # Variance of a random walk around a spline through the means of blocks of n steps: 0.115 n
+    # times that of a step, simulated for n = 2 to 16.
     within = step_rad.to(torch.float64).square() * size * 0.115
-    # two results of the same deviation differ by the square root of two of it
+    # two results of equal standard deviation differ by the square root of two times that deviation
     spread = (std[best, trial].square() + (within + apart.square() / 2)[:, None]).sqrt()
     at = torch.arange(n, dtype=torch.float64, device=cells.device)
     block = ((at - first) / size).floor().clamp(0, count - 1).long()
@@ -274,7 +277,9 @@ def linked_walk(cells: Tensor, polished_rad: Tensor, step_rad: Tensor) -> Walk:
 
 
 def _parts(found: Estimate) -> tuple[Tensor, Tensor, Tensor]:
-    """Phase, likelihood and deviation; the first and third of shape (trial, pulse)."""
+    """Phase, log likelihood and standard deviation of an estimate; phase and deviation of shape
+    (trial, pulse).
+    """
     return found["phase_rad"].double(), found.info["fit_nats"], found.std["phase_rad"].double()
 
 
@@ -309,13 +314,13 @@ def smooth_walk(rows: Tensor) -> Tensor:
         return (cells * raised.log().sum(-1)).sum(0) + amplitude.square().sum(-1) / 2
 
     amplitude = torch.zeros(len(rows), len(order), dtype=real, device=rows.device)
-    for floor in (1e-1, 1e-2, 1e-3, 1e-4):  # a high floor lets the descent pass over local minima
+    for floor in (1e-1, 1e-2, 1e-3, 1e-4):  # with a high floor the descent passes over local minima
         amplitude = adam(lambda x, floor=floor: cost(x, floor), amplitude, steps=40, rate=0.15).x
     return (amplitude @ walks).to(torch.float64)
 
 
 def _without_line(phase: Tensor) -> Tensor:
-    """Phases (trial, pulse) without their slope, unwrapped, and without the line that fits them."""
+    """Unwrap phases (trial, pulse), and remove the line that fits them best."""
     pulse = torch.arange(phase.shape[-1], dtype=torch.float64, device=phase.device)
     pulse, step = pulse - pulse.mean(), torch.diff(phase)
     step = step - torch.angle(cis(step.detach()).mean(-1, keepdim=True))

@@ -58,18 +58,17 @@ def _weights(u: Tensor, bands: Bands) -> Tensor:
 
 
 def _turned(z: Tensor, u: Tensor, v: Tensor, bands: Bands) -> Tensor:
-    """The product with the phase of the velocity v removed."""
+    """Remove the phase of the velocity v from the product."""
     return z * cis(-v[..., None].to(z.real.dtype) * _weights(u, bands).to(z.real.dtype))
 
 
 def _slope(z: Tensor, u: Tensor, bands: Bands, steps: int) -> Tensor:
-    """The velocity (..., pulse) of greatest |sum z exp(-j w v)|.
-
-    The peak of a zero-padded transform, refined by Newton steps.
+    """The velocity (..., pulse) of greatest |sum z exp(-j w v)|: the peak of a zero-padded
+    transform, refined by Newton steps.
     """
     n, per = z.shape[-1], 4 * bands.radar.carrier_hz / bands.radar.wave_speed_m_s
     power = power_of(torch.fft.fft(z.detach(), 2 * n))
-    # 6 bins about the removed shift, which is right to a bin or two
+    # the search covers 6 bins on either side, because the removed shift is correct to a bin or two
     reach = min(round(6 * 2 * n / bands.time_s.shape[-1]), n // 2)
     best = torch.cat([power[..., -reach:], power[..., : reach + 1]], -1).argmax(-1) - reach
     best = best + vertex(*(take(power, (best + k) % power.shape[-1]) for k in (-1, 0, 1)))
@@ -83,7 +82,7 @@ def _through_zero(z: Tensor, u: Tensor, v: Tensor, bands: Bands) -> Tensor:
     This is the likeliest velocity if the phase of z is zero at the turning point, where w = 0.
     """
     w = _weights(u, bands).to(z.real.dtype)
-    for _ in range(3):  # by trial, enough to converge
+    for _ in range(3):  # three steps, enough to converge by trial
         turned = _turned(z, u, v, bands)
         v = v + step_uphill((turned.imag * w).sum(-1), -(turned.real * w * w).sum(-1))
     return v

@@ -164,7 +164,7 @@ def polished(
 
 
 def _unwrapped(phase: Tensor, lit: Tensor) -> Tensor:
-    """Phases (..., pulse) in rad without steps of whole turns, interpolated between lit pulses."""
+    """Unwrap phases (..., pulse) in rad, and interpolate them between lit pulses."""
     at = torch.arange(phase.shape[-1], device=phase.device).expand(phase.shape)
     last = torch.where(lit, at, -1).cummax(-1).values
     held = phase.detach().gather(-1, torch.where(last < 0, lit.to(torch.int8).argmax(-1, keepdim=True), last))
@@ -174,11 +174,12 @@ def _unwrapped(phase: Tensor, lit: Tensor) -> Tensor:
 
 @torch.no_grad()
 def _start(cells: Tensor, coarse: Estimate, enough: Tensor, radar: TriangularLadar, pulse: Axis) -> Tensor | None:
-    """Phases (..., pulse) by PGA for trials whose velocities integrate to more than 0.4 rad.
+    """Phases (..., pulse) by PGA for trials in which the error of integrated velocities exceeds 0.4
+    rad.
 
-    The bound is that of the random walk of integrated velocities, by trial: beyond a radian the
-    polish alone may end in an image of two peaks. Zero for the other trials, and below 32 periods,
-    because the first window is as wide.
+    The limit, found by trial, applies to the predicted random walk of the integrated velocities.
+    Beyond a radian, `phase_polish` alone may end in an image of two peaks. The phases are zero for
+    the other trials, and for less than 32 periods, because the first window is as wide.
     """
     walk_m = integrated_range_detrended_bound_m(coarse.info["noise_m_s"], pulse.step, pulse.n)
     far = enough & (4 * math.pi / radar.wavelength_m * walk_m > 0.4)
@@ -208,7 +209,7 @@ def deramped_lines(bands: Bands, velocity_m_s: Tensor, pulse: Axis) -> Tensor:
     """
     radar, m = bands.radar, bands.time_s.shape[-1]
     turns = carrier_turns(sweep_motion(velocity_m_s, radar, pulse), radar)[..., 0, :, :]
-    # less the linear term that is removed already
+    # the linear term that is already removed is subtracted
     remaining = turns - torch.nn.functional.pad((bands.shift.to(torch.float64) / radar.sweep_s)[..., None], (1, 4))
     compensated = bands.up * polynomial_phasor(-remaining, radar.sweep_s / m, m, bands.up.dtype)
     lines = torch.arange(bands.first, bands.first + bands.lines, device=compensated.device)

@@ -123,10 +123,10 @@ def segmented_interference(
     def measure(spectra: Spectra) -> Measured:
         bands = spectra.bands(video=bins == "peak")
         windowed = spectra.bands(window_m, taper=0.0)
-        # with "sum", the upsampling of section 3.3.2 of the paper
+        # with "sum", the upsampling is that of section 3.3.2 of the paper
         coarse = envelope_lag(windowed, 20 if bins == "sum" else 4) / 2 + (windowed.shift - bands.shift)
         moved = bands
-        if bins == "sum":  # without the Doppler shift of the envelopes
+        if bins == "sum":  # bands without the Doppler shift that the envelopes show
             turn = cis((2 * math.pi * coarse[..., None] * (bands.time_s / radar.sweep_s)).to(bands.up.real.dtype))
             moved = replace(bands, up=bands.up * turn.conj(), down=bands.down * turn)
         halves = _halves(moved, padding, hann)
@@ -152,7 +152,7 @@ def segmented_interference(
 
 
 def _halves(bands: Bands, padding: int, hann: bool) -> tuple[Tensor, ...]:
-    """Spectra of both halves of up and of mirrored down sweeps, (..., pulse, bin) each.
+    """Spectra of both halves of the up and of the mirrored down sweeps, (..., pulse, bin) each.
 
     Their phases have the same reference.
     """
@@ -168,14 +168,13 @@ def _halves(bands: Bands, padding: int, hann: bool) -> tuple[Tensor, ...]:
 def _summed(
     halves: tuple[Tensor, ...], searched: Tensor, coarse: Tensor
 ) -> tuple[Tensor, Tensor, Callable[[], Tensor]]:
-    """Phase (..., 1, pulse) between the halves from products summed over bins, and weights of one.
+    """Phase (..., 1, pulse) between the halves, from products summed over bins, and weights of one.
 
-    The third result returns the phase that the changes of power would give, see `Law`.
-
-    Up and down spectra are multiplied and summed before the halves are combined: each sum is then
-    the power spectrum of the scene times one phasor, for any scene, after the Doppler shift
-    `coarse` (bins) is removed. Otherwise a dense scene would determine where in its half the phase
-    is read. The removed phase is added again.
+    The third result is a function that returns the phase that corresponds to the changes of power,
+    see `Law`. Up and down spectra are multiplied and summed before the halves are combined. After
+    the Doppler shift `coarse` (bins) is removed, each sum is the power spectrum of the scene times
+    one phasor, for any scene. Otherwise the distribution of a dense scene within a half would
+    change the phase. The removed phase is added again.
     """
     up1, up2, down1, down2 = (x[..., searched] for x in halves)
     first, second = ((up * down.conj()).sum(-1) for up, down in ((up1, down2), (up2, down1)))
@@ -196,8 +195,9 @@ def _at_peaks(
 ) -> tuple[Tensor, Tensor, Callable[[], Tensor]]:
     """Phases at the peaks of up and of down spectra, and the weights of Eq. (18).
 
-    The third result returns the phase that the changes of power would give, see `Law`. All are
-    (..., scatterer, pulse). A weight is zero in periods where the scatterer is not illuminated.
+    The third result is a function that returns the phase that corresponds to the changes of power,
+    see `Law`. All are (..., scatterer, pulse). A weight is zero in periods where the scatterer is
+    not illuminated.
     """
     up, down = (power_of(first) + power_of(second) for first, second in (halves[:2], halves[2:]))
     both = (up + down).detach()
@@ -208,7 +208,8 @@ def _at_peaks(
         up1, up2, down1, down2 = (take(x, at) for x, at in zip(halves, (at_up, at_up, at_down, at_down), strict=True))
         phases.append(torch.angle(up1 * up2.conj() * down1 * down2.conj()).to(torch.float64))
         picked.append(torch.stack([up1, up2, down1, down2]))
-        # Eq. (18), made independent of scale: deviation over mean of the amplitudes near a peak
+        # Eq. (18), made independent of scale: standard deviation of the amplitudes near a peak,
+        # over their mean
         part = _around(both, peak, 4 * padding)[1].sqrt()
         mean = part.mean((-2, -1))
         spread = (part - mean[..., None, None]).square().mean((-2, -1)).sqrt()
@@ -224,7 +225,9 @@ def _at_peaks(
 
 
 def _strongest(profile: Tensor, count: int, spacing: int) -> Tensor:
-    """Bins (..., count) of the greatest values of a circular profile, at a spacing or more."""
+    """Bins (..., count) of the greatest values of a circular profile, at least two
+    spacings apart.
+    """
     n = profile.shape[-1]
     left, found = profile, []
     index = torch.arange(n, device=profile.device)
@@ -236,7 +239,7 @@ def _strongest(profile: Tensor, count: int, spacing: int) -> Tensor:
 
 
 def _around(power: Tensor, peak: Tensor, reach: int) -> tuple[Tensor, Tensor]:
-    """Bins near a peak (...,), and their power in every period, of power (..., pulse, n)."""
+    """Bins near a peak (...,), and the power (..., pulse, n) in these bins in every period."""
     near = (peak[..., None] + torch.arange(-reach, reach + 1, device=power.device)) % power.shape[-1]
     near = near[..., None, :].expand(*power.shape[:-1], -1)
     return near, power.gather(-1, near)
@@ -245,17 +248,19 @@ def _around(power: Tensor, peak: Tensor, reach: int) -> tuple[Tensor, Tensor]:
 def _unwrapped(
     phases: Tensor, weights: Tensor, coarse: Tensor, bands: Bands, unwrap: Unwrap
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """One phase and its integer per period, (..., pulse) each, and the number of slips (...,).
+    """One phase per period and its number of whole turns, (..., pulse) each, and the number of
+    slips (...,).
 
-    coarse: fd T of the envelopes beyond the removed shift.
+    coarse: Doppler shift fd T that the envelopes show beyond the removed shift.
     """
     turn = 2 * math.pi
     integer = torch.round(coarse[..., None, :] + phases.detach() / turn)
-    own = _weighted(phases - turn * integer, weights)  # phase minus whole turns: fd T = -own / 2 pi
+    # phase without whole turns: fd T = -own / 2 pi
+    own = _weighted(phases - turn * integer, weights)
     pairs = torch.minimum(weights[..., 1:], weights[..., :-1])
     change = phases.diff(dim=-1)
     step = _weighted(change - turn * torch.round(change.detach() / turn), pairs)
-    # with the removed shift, which the gradient of the phase does not contain
+    # the removed shift is added, which the gradient of the phase does not contain
     beyond = own - turn * bands.shift.to(torch.float64)
     both = bands.lit[..., 1:] & bands.lit[..., :-1] & (pairs > 0).any(-2)
     step = torch.where(both, step, beyond.diff(dim=-1))

@@ -131,7 +131,7 @@ def sweep_motion(velocity_m_s: Tensor, radar: TriangularLadar, pulse: Axis) -> T
 
 
 def _recentred(cubic: Tensor, at: Tensor) -> Tensor:
-    """Coefficients about `at` (n,) of cubics (..., n, 4) given about zero."""
+    """Coefficients of cubics (..., n, 4) about the points `at` (n,), from those about zero."""
     terms = ([math.comb(j, k) * cubic[..., j] * at ** (j - k) for j in range(k, 4)] for k in range(4))
     return torch.stack([torch.stack(of_power).sum(0) for of_power in terms], -1)
 
@@ -233,13 +233,13 @@ def polynomial_phasor(turns: Tensor, step_s: float, n: int, dtype: torch.dtype) 
     u = (start + torch.arange(n, dtype=torch.float64, device=turns.device)) * step_s
     edge = abs(start) * step_s
     bend: Tensor | None = None
-    # largest magnitude of each power; infinite inside vmap, where values cannot be read
+    # largest magnitude of each power of u; infinite inside vmap, where values cannot be read
     sizes = turns.detach().abs().reshape(-1, turns.shape[-1])
     largest = host_values(sizes.amax(0), math.inf) if turns.numel() else [math.inf] * turns.shape[-1]
     reach = [size * edge**k for k, size in enumerate(largest)]
     for k in range(len(reach) - 1, 1, -1):
         c = turns[..., k]
-        # lost in the rounding of a phasor
+        # a term this small is lost in the rounding of a phasor
         if not turns.requires_grad and reach[k] <= (1e-8 if real == torch.float32 else 1e-15):
             continue
         # a term of more than two turns needs float64: the rounding of float32 grows with the phase

@@ -35,8 +35,8 @@ from torchsar.metrics import entropy
 # largest phase error, in rad rms, of a scatterer at the edge of the target: it then still has a
 # Strehl ratio of 0.8, the convention of Marechal
 MOST_PHASE_ERROR_RAD = math.sqrt(-math.log(0.8))
-_LEAST_SCATTERERS = 3  # fewer do not determine the rotation reliably, a convention
-_CLEAR = 1.3  # power over the detection threshold that noise alone exceeds in one of 1000 images
+_LEAST_SCATTERERS = 3  # with fewer scatterers the rotation is not determined reliably, a convention
+_CLEAR = 1.3  # factor over the detection threshold: noise alone exceeds it in one of 1000 images
 
 
 def judged_motion(rows: Tensor, sampling: Sampling, motion: Motion, value: Mapping[str, Tensor]) -> Estimate:
@@ -60,7 +60,7 @@ def judged_motion(rows: Tensor, sampling: Sampling, motion: Motion, value: Mappi
     """
     third = replace(motion, k=torch.nn.functional.pad(motion.k, (0, max(0, 2 - motion.k.shape[-1]))))
     refined = third
-    for _ in range(2):  # enough for an image that is still blurred
+    for _ in range(2):  # two refinements, enough for an image that is still blurred
         refined = refined_by_histories(rows, sampling, refined)
     found = histories_of(rows, sampling, refined)
     error, reasons = _questioned(sampling, third, refined, found)
@@ -79,10 +79,10 @@ def judged_fit(rows: Tensor, sampling: Sampling, fit: Fit, value: Mapping[str, T
     """Assess a joint fit of a rotation and its scatterers.
 
     The step that the fit would take next is computed. Its curvature and the noise give a covariance
-    (Fisher information); the differences between what the scatterers ask for give another one. Both
-    are averaged, the second with the weight of the number of independent scatterers. Scatterers
-    that are not found disturb the others: standard deviations are divided by the share of the
-    energy that is accounted for.
+    (Fisher information). The scatter of the changes that single scatterers would make gives another
+    one. Both are averaged, the second with the weight of the number of independent scatterers.
+    Scatterers that are not found disturb the others: standard deviations are divided by the share
+    of the energy that is accounted for.
 
     Args:
         rows: Range-compressed pulses, shape (trial, pulse, range), complex.
@@ -119,27 +119,27 @@ def judged_fit(rows: Tensor, sampling: Sampling, fit: Fit, value: Mapping[str, T
     own = (pull - torch.einsum("bpij,bj->bpi", curvature, change)) @ inverse
     seen = (own * (alike @ own)).sum(1) / predicted
     number = 1 / (shares * (alike @ shares)).sum(1).clamp_min(tiny)
-    # two scatterers outweigh the variance that the noise explains, found by trial: a variance that
-    # a few of them show is uncertain by a factor
+    # The variance from the noise has the weight of two scatterers, found by trial, because a
+    # variance from the scatter of a few is uncertain by a factor.
     wider = (number * seen + 2 + number.clamp_max(predicted.shape[-1])) / (number + 2) + change.square() / predicted
     wider = wider.sqrt() / accounted.clamp_min(1e-6)[:, None]
     covariance = covariance * wider[:, :, None] * wider[:, None] + torch.diag_embed(torch.where(lost, math.inf, 0.0))
     std = _standard_deviations(motion, covariance, fit.change.shape[-1] > order + 1)
     step = (fit.change.abs() / predicted.sqrt()).amax(-1)
-    # a step below three deviations, or that changes phases by less than 0.01 rad, is small
+    # a step is small below three standard deviations, or if it changes phases by less than 0.01 rad
     moving = (step > 3) & (step * (fit.noise / (2 * power.sum(-1) * sampling.pulses).clamp_min(tiny)).sqrt() > 0.01)
     level = power.amax(-1) * sampling.pulses / (fit.noise * threshold(2 * rows[0].numel())).clamp_min(tiny)
     error, reasons = _questioned(sampling, motion, motion, histories_of(rows, sampling, motion))
     outcome = worst(
         *reasons,
-        # An error of 10 % of the rate up to which it scales images, a convention, must exceed 2.7
-        # standard deviations: a rate that is found too large also looks too accurate.
+        # An error of 10 % of the rate, a convention for scaling images, must exceed 2.7 standard
+        # deviations, because the standard deviation of a rate that is too large is too small.
         (Outcome.INEXACT, (2.7 * std["omega_rad_s"] >= 0.1 * motion.omega_rad_s) | (motion.w <= 0)),
-        # histories are less accurate than the fit
+        # the limit is doubled because phase histories are less accurate than the fit
         (Outcome.PARTS_DISAGREE, error >= 2 * MOST_PHASE_ERROR_RAD),
         (Outcome.MISFIT, explained < LEAST_EXPLAINED),
         (Outcome.NOT_CONVERGED, moving),
-        # one independent scatterer that shows the rate may be a peak of the noise
+        # a single independent scatterer that determines the rate may be a peak of the noise
         (Outcome.TOO_FEW, (found.count < _LEAST_SCATTERERS) | (number[:, order] < 1.3)),
         (Outcome.NOISE, level < _CLEAR),
         (Outcome.EMPTY, (rows == 0).flatten(1).all(-1)),
@@ -150,13 +150,14 @@ def judged_fit(rows: Tensor, sampling: Sampling, fit: Fit, value: Mapping[str, T
 def _questioned(
     sampling: Sampling, judged: Motion, refined: Motion, found: Histories
 ) -> tuple[Tensor, list[tuple[Outcome, Tensor]]]:
-    """Phase error in rad, rms over the aperture, of a scatterer at the edge, (trial,); and doubts.
+    """Expected phase error in rad, rms over the aperture, of a scatterer at the edge, (trial,); and
+    the doubts about it.
 
-    It is expected from the difference of two rotations and the covariance of that difference.
+    The error follows from the difference of two rotations and the covariance of that difference.
     Constant and linear phases only displace a scatterer and are left out.
     """
     count, order = found.used.sum(-1), judged.k.shape[-1]
-    lag = found.pull.shape[-1] // 5  # samples of a history that share errors
+    lag = found.pull.shape[-1] // 5  # number of samples of a history with correlated errors
     # With few scatterers, the scatter between them underestimates the variance. The scatter of the
     # samples within each history is added.
     own = lag * torch.einsum("bpij,bpkj->bik", found.pull, found.pull)
@@ -180,7 +181,9 @@ def _questioned(
 
 
 def _entropies(rows: Tensor, sampling: Sampling, motion: Motion) -> tuple[dict[str, Tensor], Tensor]:
-    """Entropies of the image with and without compensation, and the decrease of exp(entropy)."""
+    """Entropies of the image with and without compensation, and relative decrease of exp(entropy),
+    0 to 1.
+    """
     after, before = entropy(image_of(rows, sampling, motion)), entropy(torch.fft.fft(rows, 2 * rows.shape[-2], dim=-2))
     named = {"entropy_nats": after, "uncompensated_entropy_nats": before}
     return named, (1 - torch.exp((after - before).double())).clamp(0, 1)

@@ -29,8 +29,9 @@ from torchsar.focus.matched_fourier import matched_fourier
 from torchsar.optim.scalar import vertex
 from torchsar.radar import InverseRadar
 
-# samples that a segment keeps in the fine search, found by trial: reach against time; zero-padding
-# of the transforms: a peak between two bins loses little power
+# _PARTS: samples of a segment in the fine search, a compromise between reach and time found by
+# trial.
+# _PAD: zero-padding of the transforms, with which a peak between two bins loses little power.
 _PARTS, _PAD = 4, 2
 
 
@@ -152,12 +153,14 @@ def chirplet_clean(
 
 
 def _chirp(frequency: Tensor, rate: Tensor, time: Tensor, dtype: torch.dtype) -> Tensor:
-    """exp(-2j pi (f t + r t^2 / 2)), (..., pulse)."""
+    """Chirps exp(-2j pi (f t + r t^2 / 2)), (..., pulse)."""
     return unit_phasor(-(frequency[..., None] * time + rate[..., None] * (0.5 * time.square())), dtype)
 
 
 def _segments(n: int) -> tuple[int, int]:
-    """Number of segments of n pulses, and of pulses in one of their `_PARTS` samples."""
+    """Number of segments of n pulses, and number of pulses of each of the `_PARTS` samples of a
+    segment.
+    """
     segments = max(4, 2 ** round(math.log2(n) / 2))
     return segments, -(-n // (_PARTS * segments))
 
@@ -185,10 +188,10 @@ def _coarse(rows: Tensor, time: Tensor, sweep: float) -> tuple[Tensor, Tensor]:
 
 
 def _fine(rows: Tensor, frequency: Tensor, rate: Tensor) -> tuple[Tensor, Tensor]:
-    """The coarse frequency and rate, corrected by the strongest of a grid of chirps.
+    """Correct the coarse frequency and rate by the strongest of a grid of chirps.
 
-    The rows have their coarse chirp removed and are decimated. The grid spans the whole aperture;
-    its maximum is interpolated by a parabola.
+    The coarse chirp is removed from the rows, which are decimated. The chirps of the grid span the
+    whole aperture. The maximum is interpolated by a parabola.
     """
     n = rows.shape[-1]
     segments, part = _segments(n)
@@ -207,7 +210,8 @@ def _fine(rows: Tensor, frequency: Tensor, rate: Tensor) -> tuple[Tensor, Tensor
 
 
 def _vertex(values: Tensor, index: Tensor, circular: bool) -> Tensor:
-    """Offset -0.5..0.5 of the parabola through a greatest value (..., n) and its neighbours.
+    """Position -0.5 to 0.5 of the vertex of the parabola through a maximum of values (..., n) and
+    its neighbours.
 
     It is 0 at an end of an axis that is not circular.
     """

@@ -24,8 +24,9 @@ from torchsar.metrics import entropy
 from torchsar.radar.warp import warp, warp_rate
 
 _STEPS_PER_UNIT = 200  # steps per unit of the logarithm of Doppler: half a percent each
-_WIDEST = 1.4  # largest logarithm of a ratio of rates that is searched: a factor of 4
-_LEAST_RATE = 0.1  # least rate over that at the start; slower targets would nearly reverse
+_WIDEST = 1.4  # largest logarithm of a ratio of rotation rates that is searched: a factor of 4
+# least rate relative to that at the first pulse; a slower target would nearly reverse its rotation
+_LEAST_RATE = 0.1
 
 
 def coarse_warp(data: Tensor, prf_hz: float) -> Tensor:
@@ -49,27 +50,31 @@ def coarse_warp(data: Tensor, prf_hz: float) -> Tensor:
         k1 in 1/s and k2 in 1/s^2, shape (trial, 2), float64.
     """
     pulses, rows = data.shape[1], data
-    # the range cells of most energy, found by trial: accuracy against time
+    # the 16 range cells of most energy, a compromise between accuracy and time found by trial
     if data.shape[-1] > 16:
         order = data.abs().square().sum(1).topk(16, -1).indices
         rows = torch.gather(data, 2, order[:, None].expand(-1, pulses, -1))
-    # found by trial: more sections follow the rate more closely, fewer resolve Doppler better
+    # Number of sections, found by trial: more of them follow the rate more closely, fewer resolve
+    # Doppler better.
     wanted = min(28, max(8, round(math.sqrt(pulses) / 2)))
     sections = max(4, min(wanted, pulses // 8))
     duration_s = pulses / prf_hz
     times = numbers_on(data.device, duration_s / 2, duration_s)
     k = _change_of_rate(rows, prf_hz, sections, _WIDEST)
     image = _image(rows, prf_hz, k)
-    # numbers of sections, and the largest logarithm of a ratio of rates that is left; by trial
+    # The numbers of sections, and 0.35 as the largest logarithm of a remaining ratio of rates, were
+    # found by trial.
     for fewer in (6, 4, 4):
         if fewer < sections:
-            # pulses at equal steps of the rotation angle: those of a uniform rotation if k is right
+            # pulses at equal steps of the rotation angle, which are those of a uniform rotation if
+            # k is correct
             even = torch.fft.fft(torch.fft.ifftshift(image, dim=1), dim=1, norm="forward")
             left = _change_of_rate(even, prf_hz, fewer, 0.35)
             at = duration_s * warp(times, k) / warp(times[1:], k)
             other = _third_order(warp_rate(times, k) * warp_rate(at, left), duration_s)
             formed = _image(rows, prf_hz, other)
-            # longer sections suffer more from phase errors of the pulses
+            # the result of longer sections, which suffer more from phase errors of the pulses, is
+            # used only if it lowers the entropy
             better = entropy(formed) < entropy(image)
             k = torch.where(better[:, None], other, k)
             image = torch.where(better[:, None, None], formed, image)
@@ -77,10 +82,10 @@ def coarse_warp(data: Tensor, prf_hz: float) -> Tensor:
 
 
 def _change_of_rate(rows: Tensor, prf_hz: float, sections: int, widest: float) -> Tensor:
-    """k1 and k2 (trial, 2) with which the spectra of sections agree best.
+    """Coefficients k1 and k2 (trial, 2) with which the spectra of the sections agree best.
 
-    A candidate is the pair of the logarithms of the rates in the middle and at the end of the
-    aperture over that at the first pulse. widest: largest logarithm that is searched.
+    A candidate is a pair of logarithms: of the rates in the middle and at the end of the aperture,
+    each over that at the first pulse. widest: largest logarithm that is searched.
     """
     pulses, like = rows.shape[1], {"dtype": torch.float64, "device": rows.device}
     length, duration_s = 2 * (pulses // (sections + 1)), pulses / prf_hz
@@ -93,11 +98,12 @@ def _change_of_rate(rows: Tensor, prf_hz: float, sections: int, widest: float) -
     times = torch.linspace(0, duration_s, 33, **like)
 
     def best_of(candidates: Tensor, table: Tensor, count: int) -> Tensor:
-        """The `count` best of candidates (trial, candidate, 2), per trial."""
+        """Select the `count` best of candidates (trial, candidate, 2) for each trial."""
         k = _third_order(torch.exp(candidates), duration_s)
         rate = torch.log(warp_rate(middles, k).clamp_min(_LEAST_RATE))
-        # the sum of the correlations of all pairs at these shifts; through four points: a maximum
-        # between steps is not moved to one of them
+        # The cost is the sum of the correlations of all pairs at these shifts. They are
+        # interpolated through four points, so that the estimate is not drawn to a step of the
+        # table.
         reach = (table.shape[-1] - 1) // 2
         shift = (rate[..., second] - rate[..., first]) * _STEPS_PER_UNIT + reach
         shift = shift.clamp(1, 2 * reach - 1 - 1e-3)
@@ -110,17 +116,17 @@ def _change_of_rate(rows: Tensor, prf_hz: float, sections: int, widest: float) -
         score = torch.where(warp_rate(times, k).amin(-1) > _LEAST_RATE, score, -math.inf)
         return torch.gather(candidates, 1, score.topk(count, -1).indices[..., None].expand(-1, -1, 2))
 
-    # step of the search in logarithms of rates, and candidates of this grid that are refined, found
-    # by trial: reliability against time
+    # step of the search in logarithms of rates, and number of its candidates that are refined, a
+    # compromise between reliability and time found by trial
     size, kept = 0.07, 6
     step = torch.arange(-widest, widest + 1e-9, size, **like)
     best = torch.cartesian_prod(step, step).expand(rows.shape[0], -1, -1)
-    # a blur of about half a step of the grid, so that no peak is missed
+    # blurred by about half a step of the grid, so that no peak is missed
     best = best_of(best, _correlations(products, 0.03), kept)
-    # the maximum is flat: rounding in single precision would move it
+    # in single precision, rounding would move the flat maximum
     table = _correlations(products.to(torch.complex128), 0.0)
     nearby = torch.cartesian_prod(*2 * [torch.linspace(-1, 1, 5, **like)])
-    for _ in range(10):  # each refinement halves the step: to 0.0001 of a rate
+    for _ in range(10):  # each refinement halves the step, down to 0.0001 of a rate
         kept = max(1, kept // 2)
         best = best_of((best[:, :, None] + size * nearby).flatten(1, 2), table, kept)
         size /= 2
@@ -130,7 +136,8 @@ def _change_of_rate(rows: Tensor, prf_hz: float, sections: int, widest: float) -
 def _correlations(transform: Tensor, blur: float) -> Tensor:
     """Correlations of pairs of sections (trial, pair, shift) for shifts of -reach..reach steps.
 
-    transform: those correlations over frequency. blur: in the logarithm of Doppler.
+    transform: Fourier transform of the correlations. blur: width of the blur in the logarithm of
+    Doppler.
     """
     n = 2 * (transform.shape[-1] - 1)
     frequency = torch.arange(transform.shape[-1], device=transform.device) / n
@@ -141,13 +148,15 @@ def _correlations(transform: Tensor, blur: float) -> Tensor:
 
 
 def _image(rows: Tensor, prf_hz: float, k: Tensor) -> Tensor:
-    """Image (trial, line, range) of a rotation that changes by k."""
+    """Image (trial, line, range) of a target whose rotation rate changes by k."""
     return matched_fourier(rows, k, prf_hz, lines=DopplerLines(1.0), transform=Gridding(eps=SEARCH_EPS))
 
 
 def _third_order(rates: Tensor, duration_s: float) -> Tensor:
-    """k1 (1/s) and k2 (1/s^2), shape (..., 2), from the rates in the middle and at the end of the
-    aperture over that at the first pulse, shape (..., 2).
+    """Coefficients k1 (1/s) and k2 (1/s^2), shape (..., 2), of given rotation rates.
+
+    rates: in the middle and at the end of the aperture, each over that at the first pulse, shape
+    (..., 2).
     """
     middle, end = rates.unbind(-1)
     k2 = 4 * (end - 2 * middle + 1) / duration_s**2
@@ -155,13 +164,14 @@ def _third_order(rates: Tensor, duration_s: float) -> Tensor:
 
 
 def _log_spectra(data: Tensor, length: int) -> Tensor:
-    """Magnitude spectra of half-overlapping sections on logarithmic Doppler axes, of zero mean.
+    """Magnitude spectra of half-overlapping sections on logarithmic Doppler axes, with the mean
+    removed.
 
     Negative and positive Doppler have an axis each: (trial, section, row, step).
     """
     window = torch.hann_window(length, periodic=False, dtype=data.real.dtype, device=data.device)
     spectrum = torch.fft.fft(data.unfold(1, length, length // 2) * window, 2 * length).abs()
-    reach = 3.5 * math.log(2)  # octaves below the edge of the band, found by trial
+    reach = 3.5 * math.log(2)  # 3.5 octaves below the edge of the band, found by trial
     steps = math.ceil(reach * _STEPS_PER_UNIT)
     logs = torch.arange(steps, dtype=torch.float64, device=data.device) / _STEPS_PER_UNIT - reach
     position = torch.exp(logs) * (length - 1)

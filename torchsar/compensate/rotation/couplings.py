@@ -23,8 +23,9 @@ from torchsar.focus.image_lines import DopplerLines
 from torchsar.focus.matched_fourier import matched_fourier
 from torchsar.focus.transforms import Gridding
 
-# Doppler cells beyond which the coupling of scatterers is neglected, found by trial: accuracy of a
-# step against time; steps of the table per Doppler cell, enough for linear interpolation
+# _NEAR_CELLS: Doppler separation beyond which the coupling of scatterers is neglected, a compromise
+# between the accuracy of a step and time found by trial.
+# _TABLE: steps of the table per Doppler cell, enough for linear interpolation.
 _NEAR_CELLS, _TABLE = 64, 16
 
 
@@ -48,7 +49,7 @@ class Neighbours:
 
     @staticmethod
     def find(amplitude: Tensor, cell: Tensor) -> Neighbours:
-        """Find the pairs, which waits for the device once.
+        """Find the pairs. The host waits for the device once.
 
         Args:
             amplitude: Amplitudes, shape (trial, scatterer), complex; 0 where there is no scatterer.
@@ -59,12 +60,13 @@ class Neighbours:
             are left out of `shape`.
         """
         used, n = amplitude != 0, cell.shape[1]
-        # they may come that near in later steps: in each of seven they move by at most 0.3 cells
+        # pairs that are 5 cells farther apart may come near in later steps: in each of seven steps
+        # a scatterer moves by at most 0.3 cells
         near = (cell[:, :, None] - cell[:, None]).abs() < _NEAR_CELLS + 5
         near = (near & used[:, :, None] & used[:, None]).flatten()
         number = torch.arange(1, n + 1, device=cell.device)
         pairs, width = torch.stack([near.sum(), (used * number).amax()]).tolist() if len(near) else (0, 0)
-        # the indices where `near` is true; all others are written to one entry more
+        # the indices where `near` is true; all others are written to one additional entry
         place = torch.where(near, near.cumsum(0) - 1, pairs)
         every = torch.arange(len(near), device=cell.device)
         index = every.new_empty(pairs + 1).scatter_(0, place, every)[:pairs]
@@ -102,9 +104,10 @@ def envelopes(share: Tensor, row: Tensor, cells: int) -> tuple[Tensor, Tensor, T
     cell = torch.arange(cells, dtype=row.dtype, device=row.device)
     x = cell - row[..., None]
     sinc, near = torch.sinc(x), x.abs() < 1e-4
-    # near the peak the slope follows from the series: the error of either form is below 1e-10
+    # near the peak the slope follows from its series: the error of either form is below 1e-10
     slope = torch.where(near, math.pi**2 / 3 * x, (sinc - torch.cos(math.pi * x)) / torch.where(near, 1, x))
-    # the periodic response is the mean of the FFT frequencies of as many samples
+    # the periodic response is the mean of the exponentials of as many FFT frequencies as there are
+    # samples
     frequency = 2 * math.pi * (cell - cells // 2) / cells
     phasor, lines = cis(row[..., None] * -frequency) / cells, cis(torch.outer(frequency, cell))
     periodic = phasor @ lines
@@ -131,15 +134,15 @@ def inner_products(
         bases: Basis functions of slow time, shape (trial, base, pulse); zero in missing pulses.
 
     Returns:
-        Under (n, m) the sum over pulses of b_n b_m conj(s_p e_p) s_q e_q for each pair (p, q),
-        where s is the amplitude of a scatterer and e its echo of unit amplitude, shape (pair,). It
-        is 0.1 % larger for a scatterer with itself, and 0 where two scatterers lie 64 Doppler cells
-        or more apart.
+        For each key (n, m), the sum over pulses of b_n b_m conj(s_p e_p) s_q e_q for each pair (p,
+        q), shape (pair,). Here s is the amplitude of a scatterer and e its echo of unit amplitude.
+        It is 0.1 % larger for a scatterer with itself, and 0 where two scatterers lie 64 Doppler
+        cells or more apart.
     """
     separation = cell[near.trial, near.first] - cell[near.trial, near.second]
     coupled = separation.abs() < _NEAR_CELLS
     position = torch.where(coupled, separation, 0) * _TABLE + _NEAR_CELLS * _TABLE
-    # a separation just below the limit rounds to the last entry
+    # a separation just below the limit may be rounded to an index beyond the last entry
     whole = position.floor().long().clamp_max(2 * _NEAR_CELLS * _TABLE - 1)
     weight = amplitude[near.trial, near.first].conj() * amplitude[near.trial, near.second]
     # The product of a scatterer with itself is increased by 0.1 %. The curvature then remains

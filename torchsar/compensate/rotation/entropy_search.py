@@ -28,7 +28,7 @@ from torchsar.radar import InverseRadar
 
 Vector = Sequence[float] | Tensor
 Method = Literal["grid", "genetic", "evolution", "newton", "descent"]
-# options of the stage by method
+# options of the stage that each method takes
 _OPTIONS: dict[str, tuple[str, ...]] = {
     "grid": ("low", "high", "counts"),
     "genetic": ("low", "high", "population", "generations", "seed"),
@@ -138,7 +138,7 @@ def entropy_rotation(
             raise ValueError(f"entropy_rotation: method {method!r} needs random numbers; give draws=Draws(seed)")
         found = (genetic if method == "genetic" else differential_evolution)(figure, low, high, **options)
     width = high - low
-    # a minimum so near the edge is taken to lie outside, a convention
+    # a minimum this close to the edge is assumed to lie outside the search region, a convention
     edge = (torch.minimum(found.x - low, high - found.x) <= 1e-3 * width) & (width > 0)
     doubts = worst((Outcome.NOT_CONVERGED, ~found.ok), (Outcome.OUTSIDE_SEARCH, edge.any(-1)))
     history = "entropy_grid_nats" if method == "grid" else "best_entropy_nats"
@@ -147,9 +147,9 @@ def entropy_rotation(
 
 
 def _from_start(figure: ImageEntropy, method: Method, start: Any, assess: bool, **options: Any) -> Estimate:
-    """Estimate by Newton's method or L-BFGS, in units that make the unknowns about one.
+    """Estimate by Newton's method or L-BFGS, with unknowns scaled to about one.
 
-    Uniform rotation takes the place of a rotation that stops or reverses.
+    A start at which the rotation stops or reverses is replaced by uniform rotation.
     """
     x = figure.spread(figure.unknowns.vector(start, "start").detach())
     x = torch.where(figure.turn(x).feasible[..., None], x, 0)
@@ -164,12 +164,14 @@ def _from_start(figure: ImageEntropy, method: Method, start: Any, assess: bool, 
         found = newton(lambda z: figure.single(z * unit), x / unit, **options)
         finite = found.ok
     else:
-        # the first step in units of about a radian each; values near the rounding of the entropy
+        # The first step is 0.3 in units that change phases by about a radian. The value tolerance
+        # is near the rounding of the entropy.
         rounding = 1e-8 if figure.dtype == torch.complex64 else 1e-9
         known = {"first_step": 0.3, "gradient_tolerance": 1e-4, "value_tolerance": rounding, "with_gradient": True}
         options = {"steps": 60, **known, **options}
         found = lbfgs(with_gradient, x / unit, **options)
-        finite = torch.isfinite(found.cost)  # its own verdict also reports infeasible candidates on its path
+        # the outcome of the optimiser also reports infeasible candidates on its path
+        finite = torch.isfinite(found.cost)
     doubts = Outcome.of(finite & (found.converged | (found.steps < options["steps"])), Outcome.NOT_CONVERGED)
     info = {"evaluations": found.evaluations, "iterations": found.steps, "converged": found.converged}
     return _estimate(figure, found.x * unit, found.cost, doubts, info, assess)
@@ -178,7 +180,7 @@ def _from_start(figure: ImageEntropy, method: Method, start: Any, assess: bool, 
 def _estimate(
     figure: ImageEntropy, x: Tensor, cost: Tensor, doubts: Tensor, info: dict[str, Tensor], assess: bool
 ) -> Estimate:
-    """Estimate from the best vectors, their entropies and the doubts of the search."""
+    """Make the estimate from the best vectors, their entropies and the doubts of the search."""
     rotation, cost = figure.turn(x.detach()), cost.detach()
     value = values_of(rotation.omega_rad_s.abs(), rotation.warp_k, rotation.yc_m)
     if not figure.unknowns.range_term:

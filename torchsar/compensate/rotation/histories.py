@@ -33,7 +33,8 @@ from torchsar.core import cis
 from torchsar.focus.warped_sums import slow_times
 from torchsar.radar.warp import warp, warp_rate
 
-OVERSAMPLING = 2  # image lines per Doppler cell, found by trial: accuracy of peaks against time
+# image lines per Doppler cell, a compromise between accuracy of peaks and time found by trial
+OVERSAMPLING = 2
 
 
 def noise_power(power: Tensor) -> Tensor:
@@ -48,7 +49,7 @@ def noise_power(power: Tensor) -> Tensor:
         The noise power, shape (trial,).
     """
     every = power.flatten(1)
-    # of 65536 pixels: its error is then below a percent
+    # the median of 65536 pixels has an error below one percent
     return every[:, :: max(1, every.shape[-1] // (1 << 16))].median(-1).values / math.log(2)
 
 
@@ -92,7 +93,7 @@ def find_peaks(
         (power >= along[:, :-2]) & (power > along[:, 2:]) & (power >= across[..., :-2]) & (power > across[..., 2:])
     )
     maxima = torch.where(maximum & (power > floor[:, None, None]), power, 0).flatten(1)
-    # four local maxima are examined for each peak that is wanted, found by trial
+    # four local maxima are examined for each peak wanted, a number found by trial
     level, index = maxima.topk(min(4 * count, maxima.shape[-1]), -1)
     line, cell = index // n_cell, index % n_cell
     offsets = torch.cartesian_prod(
@@ -110,7 +111,8 @@ def find_peaks(
 
 
 class Histories(NamedTuple):
-    """Phase histories of bright isolated scatterers, and what they show about the rotation.
+    """Phase histories of bright isolated scatterers, and the change of the rotation that they
+    require.
 
     Args:
         cells: Doppler of the scatterers in Doppler cells, shape (trial, peak).
@@ -176,8 +178,8 @@ def histories_of(
     image = image_of(data, sampling, motion, oversampling=OVERSAMPLING)
     power = image.abs().square()
     least = threshold(power[0].numel())
-    # Lines whose Doppler the pulse rate resolves at every time. The fastest rotation limits
-    # them; beyond them scatterers of the other end of the band return.
+    # Only lines whose Doppler the pulse rate resolves at every time are used. The fastest rotation
+    # limits them: beyond them, scatterers appear aliased from the other end of the band.
     times, lines = slow_times(sampling.pulses, sampling.prf_hz, motion.k.device), image.shape[1]
     fastest = warp_rate(times, motion.k).amax(-1) * sampling.duration_s
     whole = warp(times.new_full((1,), sampling.duration_s), motion.k)[..., 0]
@@ -185,13 +187,14 @@ def histories_of(
     resolved = (doppler.abs() * (fastest / whole)[:, None] <= lines / 2)[..., None]
     speckle = torch.where(resolved, power, math.nan).nanmedian(1, keepdim=True).values / math.log(2)
     brightest, noise = power.amax((-2, -1)), noise_power(power) * least
-    # side lobes below 1e-3 of the brightest pixel are to be expected more than 24 cells away
+    # farther than 24 cells, side lobes may reach 1e-3 of the power of the brightest pixel
     floor = torch.maximum(speckle * least, 1e-3 * brightest[:, None, None])
     clear = torch.where(resolved & (power > floor), power, 0)
-    # up to 128 scatterers, of at least half of the largest amplitude within the window; by trial
+    # up to 128 scatterers with at least half of the largest amplitude within the window, found by
+    # trial
     peak, line, cell = find_peaks(clear, noise, 128, 0.5, 2 * half_cells, 1)
     cells, used = (line - image.shape[1] // 2) / OVERSAMPLING, peak > 0
-    # the histories of windows about the peaks, (trial, peak, 2 half_cells), and u of their samples
+    # histories of windows around the peaks, (trial, peak, 2 half_cells), and u of their samples
     offsets = torch.arange(-half_cells * OVERSAMPLING, half_cells * OVERSAMPLING, device=image.device)
     row = line[..., None] + offsets
     index = row.clamp(0, lines - 1) * image.shape[2] + cell[..., None]
@@ -200,7 +203,7 @@ def histories_of(
     u = (torch.arange(2 * half_cells, dtype=torch.float64, device=image.device) + 0.5) / (2 * half_cells)
     history = window @ cis(-2 * math.pi / OVERSAMPLING * offsets[:, None] * u)
     bases = _bases(motion, sampling, cells, sampling.range_m(cell), u, free_centre)
-    # a window smears a history at both ends by 1/16 of its length, which is left out
+    # the window blurs both ends of a history over 1/16 of its length; they are left out
     ends = max(1, len(u) // 16)
     history, bases = history[..., ends:-ends], bases[..., ends:-ends]
     seen = torch.stack([part.mean(-1).abs().square() for part in history.tensor_split(4, -1)], -1)
@@ -218,7 +221,7 @@ def _bases(motion: Motion, sampling: Sampling, cells: Tensor, range_m: Tensor, u
     duration_s, k = sampling.duration_s, motion.k
     whole = warp(u.new_full((1,), duration_s), k)
     times = (u * duration_s).expand(len(k), -1)
-    for _ in range(8):  # Newton steps to the times of equal warped time
+    for _ in range(8):  # Newton steps to find the times of equally spaced warped time
         times = (times - (warp(times, k) - u * whole) / warp_rate(times, k)).clamp(0, duration_s)
     phi, _, slopes = warped_time(k, times, duration_s)
     square = 2 * math.pi * (1 / sampling.wavelength_m) * phi.square()[:, None]
@@ -230,9 +233,8 @@ def _bases(motion: Motion, sampling: Sampling, cells: Tensor, range_m: Tensor, u
 
 
 def _fitted(history: Tensor, bases: Tensor, used: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Robust weighted least squares on phases a sixth of the histories apart.
-
-    The last three fields of `Histories`.
+    """Robust weighted least squares on the differences of phases a sixth of the histories apart.
+    Returns the last three fields of `Histories`.
     """
     lag = max(1, history.shape[-1] // 6)
     product = history[..., lag:] * history[..., :-lag].conj()
@@ -244,7 +246,7 @@ def _fitted(history: Tensor, bases: Tensor, used: Tensor) -> tuple[Tensor, Tenso
     angle = angle - (weight * angle).sum(-1, keepdim=True) / total
     difference = difference - (weight[..., None, :] * difference).sum(-1, keepdim=True) / total[..., None]
     change, inverse, pull = angle.new_zeros(bases.shape[0], bases.shape[2]), angle.new_zeros(0), angle.new_zeros(0)
-    for _ in range(3):  # reweighted fits, found by trial: enough to exclude outliers
+    for _ in range(3):  # three reweighted fits, found by trial, are enough to exclude outliers
         weighted = difference * weight[..., None, :]
         inverse = inverted(torch.einsum("bpij,bpkj->bik", weighted, difference))[0]
         change = (inverse @ torch.einsum("bpij,bpj->bi", weighted, angle)[..., None])[..., 0]
@@ -256,11 +258,11 @@ def _fitted(history: Tensor, bases: Tensor, used: Tensor) -> tuple[Tensor, Tenso
 
 
 def inverted(normal: Tensor) -> tuple[Tensor, Tensor]:
-    """Invert small normal matrices without the directions that the data do not determine.
+    """Invert small normal matrices, and leave out the directions that the data do not determine.
 
-    An eigenvalue x becomes x^3 / (x^4 + l^4) instead of 1 / x, with the limit l of what counts as
-    known. This is the real part of the mean of 1 / (x - p) for p = l exp(+j pi / 4) and
-    l exp(+3j pi / 4), so that no eigenvalues are needed, for which a GPU would make the program
+    An eigenvalue x becomes x^3 / (x^4 + l^4) instead of 1 / x, where l is the limit below which a
+    direction is not determined. This is the real part of the mean of 1 / (x - p) for p = l exp(+j
+    pi / 4) and l exp(+3j pi / 4). No eigenvalues are needed, for which a GPU would make the program
     wait.
 
     Args:
@@ -274,9 +276,10 @@ def inverted(normal: Tensor) -> tuple[Tensor, Tensor]:
     root = torch.where(scale > 0, scale, 1).rsqrt()
     unit = normal * root[:, :, None] * root[:, None]
     one = torch.eye(unit.shape[-1], dtype=unit.dtype, device=unit.device)
-    # the limit of what counts as known is above the rounding of float64, below any real information
+    # the limit is above the rounding of float64 and below any real information
     poles = [1e-7 * cmath.exp(1j * cmath.pi * turn) for turn in (0.25, 0.75)]
     inverse = torch.linalg.inv_ex(torch.stack([unit - pole * one for pole in poles])).inverse.real.mean(0)
-    # diagonal of the projection to the directions that are left out, a share of an unknown of 0.01
-    lost = ~(1 - (unit * inverse).sum(-1) <= 0.01)  # also where it is no number
+    # An unknown counts as lost if more than 0.01 of it is in the directions that are left out. The
+    # diagonal of the projection to these directions is that share.
+    lost = ~(1 - (unit * inverse).sum(-1) <= 0.01)  # true also for NaN
     return inverse * root[:, :, None] * root[:, None], lost

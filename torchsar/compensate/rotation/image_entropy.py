@@ -121,8 +121,8 @@ class Unknowns:
         finite = torch.isfinite(x).all(-1)
         k = torch.where(finite[..., None], k, 0)
         if self.variables == "shape":
-            # the warp grows at the first pulse if 1 + sum q_j P_j'(-1) > 0, with
-            # P_j'(-1) = -(-1)^j j (j + 1) / 2; below 1e-6, k, relative to that, would be infinite
+            # The warp grows at the first pulse if 1 + sum q_j P_j'(-1) > 0, with P_j'(-1) = -(-1)^j
+            # j (j + 1) / 2. Below 1e-6, the relative derivatives k would be practically infinite.
             j = torch.arange(2, k.shape[-1] + 2, dtype=k.dtype, device=k.device)
             slope = torch.where(j.remainder(2) == 0, -0.5, 0.5) * j * (j + 1)
             grows = 1 + (k * slope).sum(-1) > 1e-6
@@ -169,7 +169,7 @@ class Unknowns:
             The changes, positive, shape (..., n).
         """
         raw, t = self.variables == "raw", self.duration_s
-        # of a raw unknown: the k_i that makes q_(i+1) = 1 where all others are 0 and small
+        # the scale of a raw unknown k_i makes q_(i+1) = 1 if all others are 0
         scales = [
             math.factorial(2 * i + 2) / (2 * math.factorial(i + 1) * t**i) if raw else 1 for i in range(1, self.order)
         ]
@@ -210,7 +210,7 @@ class Unknowns:
         return x
 
     def _phi(self, k: Tensor) -> Tensor:
-        """phi(T), (...,)."""
+        """Warped time phi(T) at the end of the aperture, (...,)."""
         return warp(torch.full((1,), self.duration_s, dtype=k.dtype, device=k.device), k)[..., 0]
 
 
@@ -357,7 +357,7 @@ class ImageEntropy:
         self.trials, self.dtype = data.shape[:-2], data.dtype
         unit = unit_level(data.detach())
         rms = power_of(unit).mean((-2, -1), keepdim=True).sqrt()
-        # at unit rms, squares neither underflow nor overflow
+        # at unit rms, the squares of samples neither underflow nor overflow
         self.rows = (unit / torch.where(rms > 0, rms, 1)).reshape(-1, *data.shape[-2:])
         known = torch.as_tensor(0.0 if yc_m is None else yc_m, dtype=torch.float64, device=data.device).detach()
         self._yc = known.expand(self.trials).reshape(-1)
@@ -511,7 +511,7 @@ class ImageEntropy:
             yield from (slice(i, min(i + height, begin + whole)) for i in range(begin, begin + whole, height))
 
     def _cost(self, part: slice, x: Tensor, count: int) -> Tensor:
-        """Entropies (row,) of a block of vectors (row, n)."""
+        """Entropies (row,) of the images for a block of vectors (row, n)."""
         own = slice(part.start // count, (part.stop - 1) // count + 1)
         rotation = self.unknowns.turn(x.to(torch.float64), self._yc[own])
         pulses = self.rows[own]
@@ -530,7 +530,7 @@ class ImageEntropy:
             Gridding(self.objective.taps),
         )
         image = matched_fourier(pulses, rotation.warp_k, self.sampling.prf_hz, lines=lines, transform=transform)
-        # -sum p ln p with p = |I|^2 / sum |I|^2, of images of about unit level
+        # The entropy is -sum p ln p with p = |I|^2 / sum |I|^2. The images have a level of about 1.
         power = torch.view_as_real(image).square().sum(-1)
         total = power.sum((-2, -1), dtype=torch.float64)
         logs = torch.log(power.clamp_min(torch.finfo(power.dtype).tiny))

@@ -21,7 +21,7 @@ from torchsar.focus.transforms import Gridding
 from torchsar.focus.warped_sums import slow_times
 from torchsar.radar.warp import warp
 
-SEARCH_EPS = 1e-3  # accuracy of the transform in estimates; images use a better one
+SEARCH_EPS = 1e-3  # accuracy of the transform during estimation; images use a better one
 
 
 def each(change: Callable[..., Tensor], *objects: Any) -> Any:
@@ -160,9 +160,8 @@ class Motion:
 
     @property
     def omega_rad_s(self) -> Tensor:
-        """Rotation rate at the first pulse in rad/s, shape (trial,).
-
-        It is 0 where the estimate of its square is negative.
+        """Rotation rate at the first pulse in rad/s, shape (trial,). It is 0 where the estimate of
+        its square is negative.
         """
         return torch.where(self.w > 0, torch.where(self.w > 0, self.w, 1).sqrt(), 0)
 
@@ -196,7 +195,7 @@ class Motion:
         """
         ends = sampling.range_m(numbers_on(self.w.device, 0.0, sampling.cells - 1.0))
         whole = warp(numbers_on(self.w.device, sampling.duration_s), self.k)
-        # a rotation by the angle a changes the phase at range y by a^2 y / wavelength turns
+        # a rotation by the angle a changes the phase at range y by a^2 y / wavelength cycles
         turns = 1 / sampling.wavelength_m * (self.w[:, None] * ends + self.offset[:, None]).abs() * whole.square()
         return torch.isfinite(self.k).all(-1) & (turns < sampling.pulses / 4).all(-1)
 

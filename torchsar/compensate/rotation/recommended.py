@@ -1,6 +1,5 @@
-"""The recommended estimator of non-uniform rotation, and estimators of its first steps alone.
-
-And the autofocus of a target that rotates.
+"""The recommended estimator of non-uniform rotation, estimators of its first steps alone, and the
+autofocus of a rotating target.
 """
 
 from __future__ import annotations
@@ -129,11 +128,12 @@ def uneven_rotation(
     def find(rows: Tensor, sampling: Sampling, known: Tensor | None) -> Fit:
         options = {"free_centre": known is None}
         motion = refined_by_histories(rows, sampling, _start(order, rows, sampling, known), **options)
-        # a fit of one scatterer for 1000 samples costs as much as about thirty images
+        # with one scatterer for 1000 samples, a fit costs as much as about thirty images
         count = min(MOST, max(128, sampling.pulses * sampling.cells // 1000)) if scatterers is None else scatterers
         fit = fit_scatterers(rows, sampling, motion, **options, count=count, rounds=rounds)
         if scatterers is None:
-            # many more scatterers than usual leave most of the energy unexplained
+            # trials that have many more scatterers than usual, of which most of the energy is not
+            # explained, are fitted with more of them
             poor = explained_share(rows, fit)[0] < LEAST_EXPLAINED
             at = (poor & (2 * fit.scatterers.count > count)).nonzero()[:, 0]
             if len(at):
@@ -218,7 +218,7 @@ def coarse_rotation(
 
 
 def _start(order: int, rows: Tensor, sampling: Sampling, known: Tensor | None) -> Motion:
-    """The coarse warp in `order` terms, with rate zero."""
+    """Motion with the coarse warp of `order` terms and the rate zero."""
     k = (
         coarse_warp(rows, sampling.prf_hz)
         if order > 1
@@ -240,7 +240,9 @@ def _over_trials(
     range_m: Tensor,
     yc_m: Tensor | float | None,
 ) -> Estimate:
-    """find(rows, sampling, known centre) in blocks of trials, each divided by its level."""
+    """Call find(rows, sampling, known centre) on blocks of trials, each divided by its
+    rms level.
+    """
     data = checked_samples(data, name, "pulse, range")
     sampling = Sampling.of(name, data, wavelength_m, prf_hz, range_m)
     trials, rows = data.shape[:-2], data.detach().reshape(-1, *data.shape[-2:])
@@ -252,7 +254,7 @@ def _over_trials(
                 f"{name}: yc_m must be one number (m) or one per trial {tuple(trials)}, got shape {tuple(known.shape)}"
             )
         known = known.expand(trials).reshape(-1)
-    # eight times the size that is best for one operation, found by trial
+    # eight times the block size that is best for one operation, found by trial
     height = max(1, 8 * block_bytes_of(data.device) // (rows[0].numel() * rows.element_size()))
     parts: dict[int, Estimate] = {}
 
@@ -280,7 +282,8 @@ def _over_trials(
 
 
 class _Rotation(Stage):
-    """An estimator of the rotation; a connected yc_m takes precedence over its own.
+    """Base of the stages that estimate a rotation. A connected yc_m replaces the setting of the
+    stage.
 
     yc_m: the range centre deviation (m) known a priori, or None to estimate it.
     """
@@ -315,7 +318,8 @@ class _Rotation(Stage):
             signal.data,
             wavelength_m=self.radar.wavelength_m,
             prf_hz=1 / signal.axis("pulse").step,
-            range_m=signal.axis("range").values(torch.device("cpu")),  # only their spacing is read, by the host
+            # the host reads only their spacing
+            range_m=signal.axis("range").values(torch.device("cpu")),
             order=self.order,
             yc_m=self.yc_m if yc_m is None else yc_m,
             **self.options,
@@ -502,7 +506,7 @@ def rotation_autofocus(
             warp_k, pulses.n, prf_hz, dtype=data.dtype, lines=DopplerLines(1.0), transform=Gridding(eps=SEARCH_EPS)
         )
     )
-    # the last floor of `entropy_fixed_point` and the relaxation of `autofocus`
+    # the floor is the last one of `entropy_fixed_point`, and the relaxation that of `autofocus`
     runs = [Run(LogAbove(2.0), through, search, 1.8, 0.01), Run(Wiener(), through, polish, 1.0, 1e-3)]
 
     def find(rows: Tensor, present: Tensor, begin: Tensor | None) -> tuple[Tensor, Tensor]:

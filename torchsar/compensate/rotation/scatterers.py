@@ -30,13 +30,15 @@ from torchsar.core import power_of, real_dtype, reduced_turns, settle
 from torchsar.focus.warped_sums import slow_times
 from torchsar.radar.warp import least_rate
 
-MOST, ROUNDS = 800, 12  # largest number of scatterers, number of steps; accuracy against time
+# largest number of scatterers, and number of steps, a compromise between accuracy and time
+MOST, ROUNDS = 800, 12
 # Iterations in which further scatterers are sought, and the fraction of the largest number up to
 # which they are added. The brightest ones bring the rotation near the solution, and the iterations
 # between let the fit converge.
 _SEARCHES = {0: 0.1, 2: 0.6, 4: 1.0}
 _SEARCHED = max(_SEARCHES)
-_STEP = 0.3  # largest motion of a scatterer in one step, in cells: beyond it the model is not linear
+# largest motion of a scatterer in one step, in cells; beyond it the model is not linear
+_STEP = 0.3
 # least share of the energy above the noise that the scatterers explain, found by trial: a lower
 # share accepts wrong focus, a higher one rejects targets of many faint scatterers
 LEAST_EXPLAINED = 0.5
@@ -156,7 +158,8 @@ def fit_scatterers(
     fit = Fit(
         start,
         Scatterers(empty.to(torch.complex128), empty, empty),
-        start.w.new_full((len(data),), 0.5),  # midway between the two kinds
+        # initial share of the periodic response, midway between the two kinds
+        start.w.new_full((len(data),), 0.5),
         start.w.new_full((len(data),), math.inf),
         torch.zeros(len(data), dtype=torch.int64, device=device),
         torch.zeros(len(data), dtype=torch.bool, device=device),
@@ -166,14 +169,14 @@ def fit_scatterers(
     for iteration in range(rounds + 1):
         share, noise, new = _SEARCHES.get(iteration), fit.noise, None
         if share or iteration > _SEARCHED:
-            # the residual of the last search was larger: the fit had not converged
+            # if the residual of the last search was larger, its fit had not converged
             image = image_of(residual, sampling, fit.motion, oversampling=OVERSAMPLING if share else 1)
             power = power_of(image)
             brightest = power.flatten(1).amax(-1, keepdim=True) / sampling.pulses
             brightest = torch.cat([fit.scatterers.amplitude.abs().square(), brightest], -1).amax(-1)
-            # Of a pixel; missing pulses add no noise. Errors of the model have 1e-4 of the power of
-            # the brightest scatterer, found by trial: weaker noise does not limit the fit, and
-            # residuals below it are no scatterers and no evidence against one.
+            # Noise power per pixel; missing pulses add no noise. Errors of the model reach 1e-4 of
+            # the power of the brightest scatterer, found by trial. Weaker noise does not limit the
+            # fit, and residuals below that level are no scatterers and no evidence against one.
             floor = torch.maximum(noise_power(power).double(), 1e-4 * brightest)
             noise = torch.minimum(fit.noise, floor / present.double().mean(-1).clamp_min(1e-3))
             new = _new_scatterers(image, floor, sampling.pulses, fit, math.ceil(count * share)) if share else None
@@ -184,7 +187,8 @@ def fit_scatterers(
             near = Neighbours.find(found.amplitude, found.cell)
             used = each(lambda x, width=near.shape[1]: x[:, :width], found)
             fit = replace(fit, scatterers=used, noise=noise)
-        # no trial settles before the search is over; an accelerator should not wait in every round
+        # No trial ends before the search is over. An accelerator should not wait for the decision
+        # in every round.
         looks = iteration > _SEARCHED and (device.type == "cpu" or iteration % 2 == 0)
         if iteration == rounds or (looks and bool(fit.settled.all())):
             break
@@ -193,11 +197,13 @@ def fit_scatterers(
 
 
 def _new_scatterers(image: Tensor, floor: Tensor, pulses: int, fit: Fit, bound: int) -> Scatterers:
-    """Scatterers that clearly exceed the residual: up to `bound` per trial, with the known ones."""
+    """Scatterers that clearly exceed the residual, of which at most `bound` are left per trial
+    together with the known ones.
+    """
     power = power_of(image)
     least = (floor * threshold(power[0].numel())).to(power.dtype)
-    # of at least half of the largest amplitude within 24 lines and 2 range cells, found by trial:
-    # side lobes are excluded until their scatterer is subtracted
+    # The peaks have at least half of the largest amplitude within 24 lines and 2 range cells, found
+    # by trial. Side lobes are thus excluded until their scatterer is subtracted.
     peak, line, row = find_peaks(power, least, bound, 0.5, 24, 2)
     wanted = torch.arange(peak.shape[-1], device=power.device) < (bound - fit.scatterers.count)[:, None]
     value = torch.gather(image.flatten(1), 1, line * image.shape[2] + row).to(torch.complex128)
@@ -206,11 +212,12 @@ def _new_scatterers(image: Tensor, floor: Tensor, pulses: int, fit: Fit, bound: 
 
 
 def _phasors(left: Tensor, right: Tensor, dtype: torch.dtype) -> Tensor:
-    """exp(2j pi left @ right), (trial, pulse, scatterer), for a block of pulses.
+    """Phasors exp(2j pi left @ right), (trial, pulse, scatterer), for a block of pulses.
 
-    left: float64 (trial, pulse, 2) turns per unit of right, (trial, 2, scatterer). One pulse of
-    every few is computed in float64, the differences of its neighbours from it, a few turns, in the
-    working precision. Faster than `core.unit_phasor` of every element.
+    left: float64 (trial, pulse, 2), cycles per unit of right, (trial, 2, scatterer). The phase of
+    one pulse in each group of 16 is computed in float64. The differences of the others from it are
+    only a few cycles and are computed in the working precision. This is faster than
+    `core.unit_phasor` of every element.
     """
     working, pulses, group = real_dtype(dtype), left.shape[1], 16
     near = torch.arange(pulses, device=left.device) // group * group + group // 2
@@ -224,8 +231,8 @@ def _phasors(left: Tensor, right: Tensor, dtype: torch.dtype) -> Tensor:
 def _blocks(data: Tensor, scatterers: int) -> Iterator[tuple[slice, slice]]:
     """Trials and pulses of blocks whose phasors fit into the cache.
 
-    How pulses are divided does not depend on the number of trials, nor on how many scatterers the
-    other trials of a batch have, so that sums round equally.
+    The division of the pulses depends neither on the number of trials nor on the number of
+    scatterers of other trials in a batch, so that sums are rounded alike.
     """
     trials, pulses, line = data.shape[0], data.shape[1], data.element_size() * max(1, scatterers)
     height = min(pulses, max(16, (1 << 19) // line))
@@ -262,10 +269,10 @@ class Step:
         near: Pairs of neighbouring scatterers.
         products: Inner products of their echoes over slow time, see `inner_products`.
         gram: Products of the bases 1, u, du/dk..., phi^2 of slow time, shape (trial, base, base).
-        overlaps: Inner product over range cells of the range responses of each pair, its
+        overlaps: Inner product over range cells of the range responses of each pair. Its
             derivatives with respect to the range of the second scatterer, of the first one, and of
-            both, and that of the derivatives of the responses with respect to the share of the
-            periodic one.
+            both. And the inner product of the derivatives of the responses with respect to the
+            share of the periodic one.
         moments: Sums over pulses of base * conj(echo) * residual at the range of the scatterer,
             shape (trial, scatterer, base).
         shift: The same of base 1 with the derivative of the range response, shape (trial,
@@ -313,14 +320,15 @@ class Step:
         value, slope, difference = envelopes(fit.response, found.row, sampling.cells)
         weighted = (found.amplitude[..., None] * value).conj().to(data.dtype).resolve_conj()
         back = value.mH.to(data.dtype).resolve_conj()
-        # the bases are almost linearly dependent: with orthonormal ones the small part that shows
-        # the rotation is not lost in rounding
+        # The bases are almost linearly dependent. With orthonormal ones, the small part that
+        # determines the rotation is not lost in rounding.
         orthonormal, mixed = torch.linalg.qr(bases.mT)
         orthonormal = orthonormal.mT.to(data.real.dtype)
         residual, shift = torch.empty_like(data), data.new_zeros(value.shape)
         moments = bases.new_zeros(*bases.shape[:2], 2 * found.cell.shape[-1])
         for some, part in _blocks(data, count):
-            echoes = _phasors(turns[some, part], right[some], data.dtype)  # conjugate, of unit amplitude
+            # conjugate echoes of unit amplitude
+            echoes = _phasors(turns[some, part], right[some], data.dtype)
             rest = (data[some, part] - (echoes @ weighted[some]).conj()) * present[some, part, None]
             residual[some, part] = rest
             projected = torch.view_as_real((rest @ back[some]) * echoes).flatten(-2)
@@ -354,8 +362,9 @@ class Step:
         change, inverse, lost = solved(pull, curvature)
         change = change * self._within_reach(joint, change)
         if late:
-            # Steps that go back a part of the last one would go back and forth, since the curvature
-            # is an approximation. The factor, at least a half, ends a geometric sequence of steps.
+            # A step that reverses a part of the previous one indicates oscillation, because the
+            # curvature is an approximation. The factor, at least a half, is the limit of the
+            # geometric sequence of such steps.
             whole = curvature.sum(1)
             size, back = (torch.einsum("bi,bij,bj->b", old.change, whole, x) for x in (old.change, change))
             change = change / (1 - (back / or_one(size)).nan_to_num(0.0).clamp(-1, 0))[:, None]
@@ -368,18 +377,19 @@ class Step:
         )
         motion = old.motion.moved(change)
         valid = torch.isfinite(change).all(-1) & motion.possible(sampling)
-        # slower motions would nearly reverse
+        # a slower motion would nearly reverse its rotation
         valid = valid & (least_rate(motion.k, sampling.duration_s) > 0.05)
         std = (inverse.diagonal(dim1=-2, dim2=-1).clamp_min(0) / 2).sqrt() * noise.sqrt()[:, None]
         std = torch.where(lost, math.inf, std).clamp_min(torch.finfo(torch.float64).tiny)
         small = (change.abs() / std).amax(-1) <= 0.2
-        # Least squares for the share of the periodic range response. Both responses are the same
-        # where scatterers lie in the middle of their cells, as all do after the first search: the
-        # share then stays as it is, instead of following rounding.
+        # Least squares for the share of the periodic range response. Both responses are equal where
+        # scatterers lie in the middle of their cells, as all do after the first search. The small
+        # ridge then keeps the share unchanged, which would otherwise follow rounding errors.
         energy = (self.products[(0, 0)] * (self.overlaps[4] + 1e-6 * self.overlaps[0])).real[:, None]
         share = torch.nan_to_num(self.share / self.near.per_scatterer(energy).sum((-2, -1)), 0.0, 0.0, 0.0)
         new = Fit(motion, moved.apart(), (old.response + share).clamp(0, 1), noise, old.steps, old.settled, change)
-        # where the step is not possible, the fit stays; trials that have ended are not counted on
+        # Where the step is not possible, the fit remains unchanged. The steps of trials that have
+        # ended are not counted.
         new = replace(chosen(valid, new, old), noise=noise, change=torch.where(valid[:, None], change, math.inf))
         new = replace(new, steps=old.steps + 1, settled=valid & small & (iteration > _SEARCHED))
         return chosen(old.settled, old, new)
@@ -392,9 +402,9 @@ class Step:
                 rotation, as that of several scatterers in one resolution cell does.
 
         Returns:
-            The unknowns of the scatterers per unit of each parameter of the rotation, and, in the
-            last column, for an unchanged rotation, shape (trial, 4 scatterer, parameter + 1); and
-            the gradient and the curvature of the rotation, see `solved`.
+            The unknowns of the scatterers per unit of each parameter of the rotation and, in the
+            last column, those for an unchanged rotation, shape (trial, 4 scatterer, parameter + 1).
+            And the gradient and the curvature of the rotation, see `solved`.
         """
         slopes, solve = self._slopes(), _solver(self._local())
         found = self._without_scatterers(slopes, solve)
@@ -405,7 +415,11 @@ class Step:
         return self._without_scatterers(slopes * self._agreement(slopes, change)[..., None, None], solve)
 
     def _without_scatterers(self, slopes: Tensor, solve: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-        """The equations of the rotation for these coefficients of its parameters."""
+        """Equations of the rotation after the unknowns of the scatterers are eliminated.
+
+        slopes: phase coefficients of the parameters, see `_slopes`. solve: solver of the equations
+        of the scatterers.
+        """
         conjugate = self.fit.scatterers.amplitude.conj()
         cross, shared = self._shared(slopes)
         turned, moved = conjugate[..., None] * self.moments, (conjugate * self.shift).real
@@ -417,10 +431,11 @@ class Step:
         return joint, pull, shared - lost[..., :-1]
 
     def _agreement(self, slopes: Tensor, change: Tensor) -> Tensor:
-        """Weights 0..1 (trial, scatterer) by how well the phase of a scatterer fits the step.
+        """Weights 0 to 1 (trial, scatterer) that are smaller, the less the phase of a scatterer
+        agrees with the step.
 
-        What the step and the unknowns of the scatterer itself leave of the phase is measured in its
-        standard deviations.
+        The phase that remains after the step and the fit of the unknowns of the scatterer is
+        measured in its standard deviations.
         """
         power = self.fit.scatterers.amplitude.abs().square()
         turned = (self.fit.scatterers.amplitude.conj()[..., None] * self.moments).imag
@@ -430,15 +445,17 @@ class Step:
         off = (turned - turned[..., :2] @ project)[..., 2:] - wanted
         size = (off @ inverted(curved)[0] * off).sum(-1) / torch.where(power > 0, power, 1)
         size = torch.where(power > 0, 2 * size / self.fit.noise[:, None], torch.nan)
-        # errors that all scatterers share, as those of pulse phases, must not favour weak ones
+        # errors that all scatterers have in common, such as those of pulse phases, must not give
+        # weak ones more weight
         usual = (size.nanmedian(-1, keepdim=True).values / curved.shape[-1]).nan_to_num(1.0).clamp_min(1)
-        # a phase may differ by 5 standard deviations before it loses weight, found by trial
+        # a phase may differ by 5 standard deviations before its weight decreases much, found by
+        # trial
         return 1 / (1 + (size / (usual * 5.0**2)).nan_to_num(0.0))
 
     def _within_reach(self, joint: Tensor, change: Tensor) -> Tensor:
         """Factor (trial, 1) of a change that limits the Doppler by which it moves scatterers.
 
-        Those of a tenth of the largest amplitude or more count, found by trial.
+        Only scatterers with at least a tenth of the largest amplitude are limited, found by trial.
         """
         line = (joint[..., :-1] @ change[..., None])[..., 0].unflatten(-1, (4, -1))[:, 2].abs()
         level = self.fit.scatterers.amplitude.abs()
@@ -460,21 +477,20 @@ class Step:
             [-u.imag, -u.real, (bent * overlap).real, -us.imag],
             [b.real, -b.imag, ub.imag, (flat * bend).real],
         ]
-        # row i and column j of the blocks, zero where two scatterers do not form a pair
+        # element (i, j) of the 4 x 4 blocks, zero where two scatterers do not form a pair
         near, count = self.near, self.near.shape[1]
         local = a.real.new_zeros(near.shape[0], 4 * count, 4 * count)
         for (i, row), j in itertools.product(enumerate(rows), range(4)):
             local[near.trial, near.first + i * count, near.second + j * count] = row[j]
         diagonal = local.diagonal(dim1=-2, dim2=-1)
-        # above the rounding of float64; zero without a scatterer, or with one range cell, which
-        # does not determine range
+        # The ridge exceeds the rounding of float64. The diagonal is zero where there is no
+        # scatterer, or only one range cell, which does not determine range.
         diagonal += torch.where(diagonal > 0, 1e-9 * diagonal, 1.0)
         return local
 
     def _slopes(self) -> Tensor:
-        """Coefficients of the bases in the phase per unit of each common unknown.
-
-        (trial, scatterer, unknown, base).
+        """Phase of the echo of each scatterer per unit of each common unknown, as coefficients of
+        the bases, (trial, scatterer, unknown, base).
         """
         motion, cell = self.fit.motion, self.fit.scatterers.cell
         order, size = motion.k.shape[-1], self.fit.change.shape[-1]
@@ -485,10 +501,11 @@ class Step:
         return slopes
 
     def _shared(self, slopes: Tensor) -> tuple[Tensor, Tensor]:
-        """Curvature between scatterers and common unknowns, and of the common unknowns.
+        """Curvature between scatterers and common unknowns, (trial, 4 scatterer, unknown), and
+        curvature of the common unknowns.
 
-        (trial, 4 scatterer, unknown) and, as sums over the pairs of each scatterer, (trial,
-        scatterer, unknown, unknown).
+        The second one is given as sums over the pairs of each scatterer, (trial, scatterer,
+        unknown, unknown).
         """
         near, bases, (overlap, _, back, *_) = self.near, range(2, slopes.shape[-1]), self.overlaps
         columns = slopes[near.trial, near.second].unbind(-1)[2:]
@@ -508,9 +525,11 @@ class Step:
 
 
 def _solver(matrix: Tensor) -> Callable[[Tensor], Tensor]:
-    """Solve equations of the scatterers' unknowns, for right-hand sides (trial, 4 scatterer, n).
+    """Function that solves the equations of the unknowns of the scatterers, for right-hand sides
+    (trial, 4 scatterer, n).
 
-    In trials in which rounding has made the matrix indefinite, each scatterer is solved alone.
+    In trials in which rounding has made the matrix indefinite, the equations of each scatterer are
+    solved separately.
     """
     factor, info = torch.linalg.cholesky_ex(matrix)
     own = matrix.unflatten(2, (4, -1)).unflatten(1, (4, -1)).diagonal(dim1=2, dim2=4).movedim(-1, 1)
