@@ -25,7 +25,7 @@ def delayed(lines: Tensor, fraction: Tensor, analytic: bool = False) -> Tensor:
         is False.
     """
     n = lines.shape[-1]
-    # inside vmap, where values cannot be read, shifts may be other than zero
+    # inside vmap, where values cannot be read, the shift may differ from zero
     if not analytic and not fraction.requires_grad and not host_value(fraction.any(), True):
         return lines
     spectrum = torch.fft.fft(lines)

@@ -19,12 +19,14 @@ from torch import Tensor
 from torchsar.core import Outcome, worst
 from torchsar.repair.jitter import uncrossed
 
-# Largest standard deviations. Of a phase in rad and of a relative gain: the remaining imbalance is
-# 20 dB below the signal. Of an offset of sampling instants in samples: -24 dB. Of a phase response
-# in rad: -18 dB.
+# Largest standard deviations of good estimates.
+# _MOST_IMBALANCE: of a phase in rad and of a relative gain. The remaining imbalance is 20 dB below
+# the signal.
+# _MOST_OFFSET: of an offset of sampling instants in samples. The remaining error is at -24 dB.
+# _MOST_RESPONSE: of a phase response in rad. The remaining error is at -18 dB.
 _MOST_IMBALANCE, _MOST_OFFSET, _MOST_RESPONSE = 0.1, 0.01, 0.125
-# Cramer-Rao bound in rad up to which the search for a phase response finds the right minimum, by
-# measurement: wrong from 0.09 on.
+# Largest Cramer-Rao bound in rad with which the search for a phase response finds the right
+# minimum, by measurement: results were wrong from 0.09 on.
 _MOST_BOUND = 0.08
 
 
@@ -75,21 +77,20 @@ def assess_imbalance(
         looks: Samples of a channel, and samples over which its noise is averaged.
 
     Returns:
-        Fields of an Estimate: NOISE where the coherence of neighbouring lines may be due to chance
-        or a phase is that of noise, SINGULAR where a channel has no power, EMPTY for zeros, TOO_FEW
-        with fewer than 8 blocks of lines, INEXACT where a deviation
-        exceeds 0.1.
+        Fields of an Estimate: NOISE where the coherence of neighbouring lines may be due to chance,
+        or a phase is that of noise. SINGULAR where a channel has no power. EMPTY for zeros. TOO_FEW
+        with fewer than 8 blocks of lines. INEXACT where a deviation exceeds 0.1.
     """
     product = gain * torch.roll(gain, 1, -1) / gain.square().mean(-1, keepdim=True)
     coherence = (lag.abs() / product.clamp_min(1e-300)).mean(-1).clamp(0, 1)
     gain_std, phase_std = (left_out_deviation(values) for values in left_out)
     share = (noise / power[..., None].clamp_min(1e-300)).clamp_max(0.99)
-    # An error of the noise level brings the powers of the channels closer together or farther
-    # apart. It is three of its standard deviations, or 3 % of the power where it is not known.
+    # An error of the noise level changes the ratios of the powers of the channels. It is three of
+    # the standard deviations of that level, or 3 % of the power where the level is not known.
     bias = torch.where(share > 0, 3 / math.sqrt(looks[1]) * share / (1 - share), 0.03)
     gain_std = root(gain_std.square() + (gain * torch.log(gain) * bias).square())
-    # by choice: a phase that is uncertain by 0.25 rad is that of noise, and where the noise is not
-    # known the coherence must exceed 0.2
+    # By choice: a phase that is uncertain by 0.25 rad is that of noise. Where the noise is not
+    # known, the coherence must exceed 0.2.
     chance = (coherence < 5 / math.sqrt(looks[0])) | (phase_std > 0.25).any(-1)
     known = (share > 0).all(-1) | (coherence > 0.2)
     inexact = (phase_std > _MOST_IMBALANCE) | (gain_std > _MOST_IMBALANCE * gain)
@@ -184,8 +185,9 @@ def assess_response(
 ) -> dict[str, Any]:
     """Assess a phase response.
 
-    Its deviation is half the difference of two halves of the points, and the phase that finer
-    degrees would add in both of them: one step of descent whose length is slope over curvature.
+    The deviation has two parts. One is half the difference of the phases from two halves of the
+    points. The other is the phase that finer degrees would add in both halves: one step of descent,
+    whose length is the slope over the curvature.
 
     Args:
         found: Coefficients in rad of the first halves, then of the second ones, shape (2 trial, p).
@@ -198,7 +200,7 @@ def assess_response(
 
     Returns:
         Fields of an Estimate: NOISE where the bound is so large that the search may end in a wrong
-        minimum, TOO_FEW where a half has no point, MISFIT where finer degrees are left, INEXACT
+        minimum. TOO_FEW where a half has no point. MISFIT where finer degrees are left. INEXACT
         where the deviation is 0.125 rad or more.
     """
     here = torch.nn.functional.pad(found, (0, degrees - found.shape[-1]))
@@ -208,7 +210,7 @@ def assess_response(
     moved = torch.cat([found, step.repeat(2, 1)], -1)
     change = sum(slope(moved).chunk(2)) - both
     curvature = (change / 2 * step).sum(-1) / step.square().sum(-1).clamp_min(1e-300)
-    # the least curvature in nats per rad^2, by measurement: 5 to 20 in sharp windows
+    # least curvature in nats per rad^2, by measurement; it was 5 to 20 in sharp windows
     finer = (first * second).sum(-1).clamp_min(0).sqrt() / curvature.clamp_min(4)
     apart = left_out_deviation(torch.stack(found.chunk(2), -2))
     std = torch.hypot(torch.linalg.vector_norm(apart, dim=-1), finer).maximum(bound)
@@ -241,13 +243,13 @@ def assess_trigger(
         symmetric.
     """
     outcome = worst(
-        # measured on scenes of 1 to 40 scatterers: above 0.7 in 97 % of the results that are right,
-        # below 0.66 where they are wrong
+        # measured on scenes of 1 to 40 scatterers: above 0.7 in 97 % of the correct results, below
+        # 0.66 in wrong ones
         (Outcome.MISFIT, ~(symmetry > 0.7 * share)),
-        # in a normal distribution the chance is 3e-7 above 5 and 1e-3 above 3
+        # a normal distribution exceeds 5 with probability 3e-7, and 3 with 1e-3
         (Outcome.AMBIGUOUS, ~((order > 5) & (fringe > 3))),
         (Outcome.OUTSIDE_SEARCH, outside),
-        # chance gives white noise a share of 0.02
+        # white noise has a share of 0.02 by chance
         (Outcome.NOISE, ~(share > 0.05)),
     )
     return {"quality": quality.clamp(0, 1), "outcome": outcome}

@@ -30,14 +30,13 @@ from torchsar.repair.assess import assess_imbalance
 
 
 def _sums(x: Tensor, noise: Tensor, blocks: int) -> tuple[Tensor, Tensor]:
-    """Products of each line with the conjugate of the line before, and powers above the noise of
-    the lines of a channel, summed over groups of lines, (..., block, channel) each.
+    """Products of each line with the conjugate of the line before, and powers of the lines of a
+    channel above the noise, (..., block, channel) each.
 
-    Group g holds, of each channel, the mean of the lines before and after line C g, weighted so
-    that their centre is line C g. A slow change of the scene is therefore the same in all channels.
-
-    x: lines (..., line, range); noise: (..., channel). The sums are divided by the power of the
-    strongest line.
+    Both are summed over groups of lines. Group g contains, for each channel, the mean of the lines
+    before and after line C g, weighted so that their centre is line C g. A slow change of the scene
+    is therefore the same in all channels. x: lines (..., line, range); noise: (..., channel). The
+    sums are divided by the power of the strongest line.
     """
     channels = noise.shape[-1]
     groups, device = x.shape[-2] // channels - 1, x.device
@@ -64,16 +63,18 @@ def _gain(own: Tensor) -> Tensor:
 
 
 def _noise(x: Tensor, channels: int) -> Tensor:
-    """Noise power per sample of each channel, (..., channel), where band or range cells are empty.
+    """Noise power per sample of each channel, (..., channel), from empty parts of the band or empty
+    range cells.
 
-    It is zero where both spectrum and cells are nearly flat, as if no part were empty, and for
-    lines of fewer than 32 samples.
+    It is zero where neither spectrum nor range cells have an empty part, and for lines of fewer
+    than 32 samples.
     """
     n, half = x.shape[-1], x.shape[-1] // 32
     if n < 32:
         return torch.zeros(*x.shape[:-2], channels, dtype=torch.float64, device=x.device)
     floors = []
-    # the averaged noise must lie six of its standard deviations below the mean power, by choice
+    # the averaged noise must lie six of its standard deviations below the mean power, by choice, to
+    # count as an empty part
     flat = 1 - 6 / math.sqrt(_looks(x, channels))
     for y in (x, torch.fft.fft(x, norm="ortho")):
         square = y.abs().square().to(torch.float64)
@@ -137,7 +138,7 @@ def estimate_imbalance(
         )
     x = unit_level(x)
     noise = _noise(x, channels)
-    # at most 16 blocks, which are left out in turn for the standard deviations, by choice
+    # at most 16 blocks, by choice; each is left out in turn for the standard deviations
     products, powers = _sums(x, noise, min(16, x.shape[-2] // channels - 1))
     product, gain = products.sum(-2), _gain(powers.sum(-2))
     value = {"gain": gain, "phase_rad": _phases(product, channels, doppler_cycles)}

@@ -22,12 +22,12 @@ from torch.nn.functional import pad
 
 from torchsar.core import checked_samples, host_value, power_of, unit_level
 
-# In units of the mean level. Speckle is exponential: exp(-30) leaves one false cell in 1e13. The
-# clean RADARSAT-1 blocks stay below 24.
+# Power in units of the mean level from which a cell may hold interference. Speckle is exponential:
+# exp(-30) leaves one false cell in 1e13. The clean RADARSAT-1 blocks stay below 24.
 THRESHOLD = 30.0
-# Least median over mean power of the blocks of a line for energy that lasts (1 for a tone, 0.7 for
-# noise-like interference, near 0 for chirps that sweep through its frequency), and least share of
-# the coherence that a tone is expected to have.
+# Least median over mean power of the blocks of a line with which its energy counts as lasting. It
+# is 1 for a tone, 0.7 for noise-like interference, and near 0 for chirps that sweep through the
+# frequency. It is also the least share of the coherence that is expected of a tone.
 LASTING = 0.35
 
 
@@ -128,7 +128,7 @@ def excess_of(power: Tensor, density: Tensor) -> Tensor:
 
 
 def _local_median(power: Tensor, width: int) -> Tensor:
-    """For each cell the larger median of the two windows, overlapping by half, that hold it."""
+    """Larger one of the medians of the two windows that contain a cell; windows overlap by half."""
     n = power.shape[-1]
     width = min(width, n)
     hop = max(1, width // 2)
@@ -138,19 +138,19 @@ def _local_median(power: Tensor, width: int) -> Tensor:
 
 
 def _clean_density(power: Tensor) -> Tensor:
-    """Mean power spectral density without interference, of spectra (..., pulse, range).
+    """Mean power spectral density of spectra (..., pulse, range) without interference.
 
-    The power of speckle divided by it has unit mean.
+    The power of speckle divided by it has a mean of one.
     """
-    # width of the local median over the band, by choice: an interferer of half of it does not raise
-    # the median; one that is wider than this is not narrowband
+    # Width of the local median over the band, by choice. An interferer of half this width does not
+    # raise the median, and a wider one is not narrowband.
     width = max(32, round(power.shape[-1] / 16))
 
     def shape_for(gain: Tensor) -> Tensor:
         relative = torch.where(gain[..., None] > 0, power / torch.where(gain > 0, gain, 1)[..., None], torch.nan)
         return _local_median(relative.nanmedian(-2).values.nan_to_num(0.0), width)
 
-    # lines relative to their median over the whole band, then over the part that holds signal
+    # lines are divided by their median over the whole band, then over the part that contains signal
     shape = shape_for(power.median(-1).values)
     lit = shape > 0.1 * shape.amax(-1, keepdim=True)
     inside = torch.where(lit[..., None, :], power / torch.where(lit, shape, 1)[..., None, :], torch.nan)

@@ -22,7 +22,7 @@ from torchsar.repair.sparse import conjugate_fill, sparse_fill
 
 
 def _mask(lines: Tensor, missing: Tensor) -> Tensor:
-    """Mask (..., pulse, 1) of missing lines; raise ValueError if it does not fit the lines."""
+    """Mask (..., pulse, 1) of missing lines. Raises ValueError if it does not fit the lines."""
     if missing.shape[-1:] != lines.shape[-2:-1]:
         raise ValueError(
             f"missing must be a mask with one entry for each of the {lines.shape[-2]} lines, as LineIntegrity "
@@ -159,7 +159,7 @@ def band_limited_fill(lines: Tensor, missing: Tensor, rounds: int = 2, steps: in
             one entry per line.
     """
     lines = checked_samples(lines, "band_limited_fill", "line, range")
-    # azimuth last: its FFTs then run along contiguous samples
+    # azimuth is the last dimension, so that its FFTs run along contiguous samples
     mask = _mask(lines, missing).mT
     filled = zero_fill(lines, missing).mT.contiguous()
     level = level_of(filled)

@@ -79,7 +79,7 @@ def notch_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
     spectrum = torch.fft.fft(raw)
     power = power_of(spectrum.detach()) / raw.shape[-1]
     hit = (excess_of(power, density) > threshold) & touched[..., None]
-    # a line that keeps more than 1.5 times the power of clutter is lost, by choice
+    # a line that still has more than 1.5 times the power of clutter counts as missing, by choice
     lost = touched & (power.masked_fill(hit, 0).sum(-1) > 1.5 * density.sum(-1))
     data = torch.where(touched[..., None], torch.fft.ifft(spectrum.masked_fill(hit, 0)), raw)
     return Repaired(
@@ -167,7 +167,7 @@ def subtract_interference(raw: Tensor, threshold: float = THRESHOLD, most_tones:
         return Repaired(
             raw * scale, nothing, nothing, found.cells.sum(-1), torch.zeros_like(nothing, dtype=torch.float64)
         )
-    # the marked lines of each trial; unmarked ones follow
+    # indices of the marked lines of each trial; unmarked lines follow
     count = host_largest(found.lines.sum(-1), found.lines.shape[-1])
     index = torch.argsort((~found.lines).to(torch.int8), dim=-1, stable=True)[..., :count]
     wide = index[..., None].expand(*index.shape, raw.shape[-1])
@@ -177,13 +177,14 @@ def subtract_interference(raw: Tensor, threshold: float = THRESHOLD, most_tones:
     cleaned = lines - sum(waveforms(lines, tones))
     for tone in reversed(tones):
         touched, cycles = touched | tone.present, torch.where(tone.present, tone.frequency, cycles)
-    # at most three bands, by choice: every round costs a search of all lines
+    # at most three bands, by choice, because every round requires a search in all lines
     for _ in range(3):
         banded = find_band(cleaned, density, threshold)
         if not anything(banded):
             break
         cleaned, touched = subtract_band(cleaned, banded, density), touched | banded
-    # lines whose cells above the threshold hold more power than the clutter of the whole line
+    # lines are missing whose cells above the threshold contain more power than the clutter of the
+    # whole line
     power = line_spectra(cleaned.detach())
     left = (power * (excess_of(power, density) > threshold)).sum(-1)
     lost = touched & (left > density.sum(-1))
@@ -215,7 +216,7 @@ def _searched(raw: Tensor, name: str, threshold: float) -> tuple[Tensor, Tensor,
 
 
 class _InterferenceCorrection(Stage):
-    """Common part of the three stages.
+    """Common part of the three stages that correct interference.
 
     Args:
         threshold: Ratio of the power of a frequency cell to the mean power of clutter above which
@@ -250,10 +251,10 @@ class _InterferenceCorrection(Stage):
             The corrected signal, and an Estimate with `missing` of shape (..., pulse), bool: lines
             that were missing before, or that this stage could not correct and set to zero.
             `quality` is the share of lines that this stage did not set to zero. The outcome is
-            EMPTY for data that are all zero, MISFIT where lines with more than four times the
-            median power of their neighbours hold more power than the rest (interference that is not
-            narrowband, or too short to be found), and TOO_FEW where less than half of the lines
-            remain. It is OK where there is no interference. `info` holds, for each trial, the
+            EMPTY for data that are all zero, and TOO_FEW where less than half of the lines remain.
+            It is MISFIT where lines with more than four times the median power of their neighbours
+            hold more power than the rest. Their interference is not narrowband, or too short to be
+            found. It is OK where there is no interference. `info` holds, for each trial, the
             numbers of corrected lines, `lines_touched`, and of contaminated frequency cells,
             `cells_touched`; and for each line whether it was corrected, `touched`, and the
             frequency of its strongest tone, `tone_cycles_per_sample`.

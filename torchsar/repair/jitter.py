@@ -34,8 +34,8 @@ from torchsar.core import (
     refuse_non_finite_values,
 )
 
-# Smallest distance of sample instants, in samples. Limit of conditioning, by choice: noise grows
-# about as 1 / gap.
+# Smallest allowed distance of sample instants, in samples. It limits the condition, by choice:
+# noise grows about as 1 / gap.
 MIN_GAP = 0.01
 
 
@@ -119,11 +119,12 @@ def band_limited_weights(instants: Tensor, band: float, floor: float = 1e-9) -> 
 
 
 def _interpolated(y: Tensor, offset_samples: Tensor, points: int, weights_of: Callable[[Tensor], Tensor]) -> Tensor:
-    """Uniform samples as weighted sums of the jittered ones next to them, with periodic lines.
+    """Interpolate uniform samples from the jittered ones next to them; lines are periodic.
 
-    Sum over k of weights[n mod M, k] y[n + first[n mod M] + k], since the pattern of offsets
-    repeats every M samples; weights_of gives the weights of instants (..., M, points) relative to
-    the uniform ones. An even number of points is centred on the interval of the uniform instant.
+    The result is the sum over k of weights[n mod M, k] y[n + first[n mod M] + k], because the
+    pattern of offsets repeats every M samples. weights_of: function that returns the weights of
+    instants (..., M, points), given relative to the uniform ones. An even number of points is
+    centred on the interval of the uniform instant.
     """
     y, offsets = _checked(y, offset_samples)
     m, device = offsets.shape[-1], offsets.device
@@ -132,7 +133,7 @@ def _interpolated(y: Tensor, offset_samples: Tensor, points: int, weights_of: Ca
     number = (torch.arange(m, device=device)[:, None] + near) % m
     instants = near + torch.gather(offsets, -1, number.flatten(-2)).reshape(near.shape)
     lowest = -(points // 2)
-    # 0 or 1: both placements share the lags lowest .. lowest + points
+    # the shift is 0 or 1, so that both placements have the lags lowest .. lowest + points in common
     shift = (first - lowest)[..., None]
     lag = torch.arange(points + 1, device=y.device)
     weights = torch.nn.functional.pad(weights_of(instants), (1, 1))
@@ -145,7 +146,7 @@ def _interpolated(y: Tensor, offset_samples: Tensor, points: int, weights_of: Ca
 
 
 def _checked(y: Tensor, offset_samples: Tensor) -> tuple[Tensor, Tensor]:
-    """Lines and offsets, float64, after their checks."""
+    """Check lines and offsets, and return them; the offsets in float64."""
     y = checked_samples(y, "correction of jitter", "range", finite=False)
     refuse_non_finite_values("correction of jitter", offset_samples=offset_samples)
     refuse_crossing(offset_samples)
@@ -191,15 +192,15 @@ def correct_jitter_exact(y: Tensor, offset_samples: Tensor, refinements: int | N
 
 
 def _solve_extended(y: Tensor, offsets: Tensor) -> Tensor:
-    """Separation of lines that are continued periodically to a multiple of M samples."""
+    """Reconstruct lines that are continued periodically to a multiple of M samples."""
     missing = -y.shape[-1] % offsets.shape[-1]
     return _separate(torch.cat([y, y[..., :missing]], -1), offsets)[..., : y.shape[-1]]
 
 
 def _separate(y: Tensor, offsets: Tensor) -> Tensor:
-    """Exact reconstruction of lines of n = M q samples.
+    """Reconstruct lines of n = M q samples exactly.
 
-    With k = s + j + i q and s = -(n // 2): Y_m[j] = e(s + j) sum_i V[m, i] X[k].
+    With k = s + j + i q and s = -(n // 2), Y_m[j] = e(s + j) sum_i V[m, i] X[k] is solved for X.
     """
     n, m = y.shape[-1], offsets.shape[-1]
     q, start = n // m, -(n // 2)

@@ -26,7 +26,7 @@ from torchsar.core import Estimate, Outcome, Signal, Stage, checked_samples, uni
 from torchsar.repair.assess import assess_offsets, of_trials
 from torchsar.repair.jitter import MIN_GAP, correct_jitter_exact, smallest_gap, uncrossed
 
-# Standard deviation of a share that may be anything between 0 and 1.
+# standard deviation of a share that may have any value between 0 and 1, about
 _MOST_SHARE = 0.3
 
 
@@ -60,22 +60,24 @@ def cyclic_fit(
     n = y.shape[-1] - y.shape[-1] % period
     taper = _taper(n, y.device)
     spectrum = torch.fft.fft(y[..., :n] * taper.to(y.real.dtype)).to(torch.complex128)
-    related = n * taper.pow(4).sum() / taper.square().sum().square()  # neighbours in a tapered spectrum
+    # number of correlated neighbours in a tapered spectrum
+    related = n * taper.pow(4).sum() / taper.square().sum().square()
     power = _smooth(spectrum.abs().square().mean(-2), max(1, 256 // y.shape[-2]))
     power = power / power.mean(-1, keepdim=True).clamp_min(1e-300)
     noise = _corrected_noise(period, n, y.device, corrected)
     density = noise.abs().square().mean(-2)
     floor = noise_floor(power / density)[..., None]
     share = torch.as_tensor(converter, dtype=torch.float64, device=y.device)[..., None]
-    signal = (power - floor * share * density).clamp_min(0)  # noise of the converter has no jitter
+    # noise of the converter has no jitter, and is subtracted
+    signal = (power - floor * share * density).clamp_min(0)
     scale = spectrum.abs().square().mean((-2, -1)).clamp_min(1e-300)[..., None]
     tilted = torch.fft.fftfreq(n, dtype=torch.float64, device=y.device) * signal
     coefficient, variance, of_noise = [], [], []
     for k in range(1, period // 2 + 1):
         step = k * (n // period)
         own = floor * (noise * torch.roll(noise, step, -1).conj()).mean(-2)
-        both = power + torch.roll(power, step, -1)  # the correlation that a periodic gain gives
-        # the ends of a line leak at least 1e-5 of the mean power into every frequency
+        both = power + torch.roll(power, step, -1)  # the correlation that a periodic gain causes
+        # leakage from the ends of a line adds at least 1e-5 of the mean power to every frequency
         weight = 1 / (power.clamp_min(1e-5) * torch.roll(power, step, -1).clamp_min(1e-5))
         slope = 2j * math.pi * (torch.roll(tilted, step, -1) - tilted)
         slope = slope - both * _along(slope, both, weight)
@@ -86,7 +88,7 @@ def cyclic_fit(
         scatter = (weight * slope.abs() * rest.abs()).square().sum(-1).clamp_min(1e-300)
         coefficient.append(value[..., 0])
         variance.append(related * scatter / information.square())
-        # the part of the noise's correlation that jitter and gain do not explain
+        # the part of the correlation of the noise that jitter and gain do not explain
         own = own - both * _along(own, both, weight)
         own = own - slope * _along(own, slope, weight)
         sums = (own.conj() * rest).real, own.abs().square(), weight * (own.abs() * rest.abs()).square()
@@ -110,8 +112,9 @@ def _along(x: Tensor, regressor: Tensor, weight: Tensor) -> Tensor:
 
 
 def _taper(n: int, device: torch.device) -> Tensor:
-    """Window that falls smoothly to zero over a sixteenth of a line at both ends, (n,): the ends of
-    a recorded line do not join, and would give correlations of their own.
+    """Window (n,) that falls smoothly to zero over a sixteenth of a line at both ends.
+
+    The ends of a recorded line do not join, and would cause a correlation of their own.
     """
     end = (torch.arange(n, dtype=torch.float64, device=device) + 0.5) / (n / 16)
     return torch.sin(math.pi / 2 * torch.minimum(end, end.flip(0)).clamp_max(1)).square()
@@ -301,11 +304,13 @@ def refine_offsets(y: Tensor, period: int, passes: int) -> tuple[Tensor, Tensor]
         moved = at + factor[active, None] * step.clamp(-0.4, 0.4)
         total[active] = torch.where((smallest_gap(moved) >= 2 * MIN_GAP)[:, None], moved, at)
         converter[active] = torch.where(share_std < _MOST_SHARE, share.clamp(0, 1), converter[active])
-        # 0.08: error of a noise level from the lowest twentieth of a spectrum of 256 or more looks
+        # the level of noise from the lowest twentieth of a spectrum of 256 or more looks has an
+        # error of 0.08
         unknown = torch.hypot(share_std.clamp_max(_MOST_SHARE), torch.full_like(factor[active], 0.08))
         level = unknown * noise / (1 - noise).clamp_min(0.1) * total[active].square().mean(-1).sqrt()
         std[active], change[active] = torch.hypot(step_std, level), step
-        # a further fit changes nothing of interest below a tenth of the standard deviation
+        # further fits are needed only where the last change exceeds a tenth of the standard
+        # deviation
         active = active[step.square().mean(-1).sqrt() > 0.1 * step_std]
         if not len(active):
             break

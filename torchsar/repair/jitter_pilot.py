@@ -88,7 +88,7 @@ def estimate_jitter_pilot(
     info = {"frequency_cycles": frequency}
     if not assess:
         return Estimate(value, outcome=Outcome.NOT_ASSESSED.like(m), info=info)
-    # Cramer-Rao bound of an offset, about the mean of all or about the first one
+    # Cramer-Rao bound of an offset, relative to the mean of all or to the first one
     bound = torch.sqrt(noise / (2 * n * power.clamp_min(1e-300))) / radians.abs()
     tested = bound * math.sqrt(longest - 1)
     std = torch.where(m == 1, tested, bound * torch.sqrt(m - 1.0))[..., None].expand(offsets.shape)
@@ -106,10 +106,12 @@ def _fit(x: Tensor, m: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Fit a tone with one free phasor for each of M interleaved converters.
 
     The frequency is that of the strongest spectral line, refined jointly with the phasors by the
-    phase slope that remains. Per trial: frequency in cycles per sample; variance of a sample about
-    the fit; mean power of the phasors; squares of their phases, weighted so that without jitter
-    their ratio to the noise is chi-squared with M - 1 degrees of freedom; and the phases in rad
-    relative to the tone, with mean zero, (..., M).
+    phase slope that remains.
+
+    Returns for each trial: the frequency in cycles per sample; the variance of a sample about the
+    fit; the mean power of the phasors; the squares of their phases; and the phases in rad relative
+    to the tone, with mean zero, (..., M). The squares are weighted so that without jitter their
+    ratio to the noise is chi-squared with M - 1 degrees of freedom.
     """
     n, fine = x.shape[-1], 4 * x.shape[-1]
     peak = torch.fft.fft(x, fine).abs().argmax(-1)
@@ -117,7 +119,7 @@ def _fit(x: Tensor, m: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     index = torch.arange(n, device=x.device) % m
     count = torch.bincount(index, minlength=m).to(torch.float64)
     position = torch.arange(n, dtype=torch.float64, device=x.device) - (n - 1) / 2
-    steps = 12  # after which the frequency is exact even in short records of strong jitter
+    steps = 12  # after 12 steps the frequency is exact even in short records of strong jitter
     for step in range(steps):
         z = x * linear_phasor(-frequency, 0, n, x.dtype)
         phasor = torch.zeros((*x.shape[:-1], m), dtype=x.dtype, device=x.device).index_add(-1, index, z) / count
@@ -133,14 +135,14 @@ def _fit(x: Tensor, m: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
 
 
 def _choose(noise: Tensor, power: Tensor, jitter: Tensor, n: int) -> Tensor:
-    """Index of the shortest period that explains the record of n samples, (...,).
+    """Index (...,) of the shortest period that explains the record of n samples.
 
     noise, power, jitter: see `_fit`, (..., period). The threshold of 14 + 4 (M - 1) keeps false
     alarms below 1e-4 per trial.
     """
-    # rounding of float64 in a record of up to 1024 samples without noise, relative to the squares
-    # of phases of jitter and to the power: without it, rounding errors look like jitter of a longer
-    # period; it grows with longer records
+    # Rounding errors of float64 in a record of up to 1024 samples without noise, relative to the
+    # squared phases of jitter and to the power. They grow with longer records. Without this limit
+    # they would look like jitter of a longer period.
     longer = max(1.0, n / 1024)
     rounding = torch.maximum(1e-13 * longer * jitter.amax(-1), 1e-28 * longer * power[..., 0] + 1e-300)
     index = torch.arange(jitter.shape[-1], device=jitter.device)

@@ -20,13 +20,13 @@ from torchsar.core import Estimate, Outcome, Signal, Stage, checked_samples, hos
 
 # line number of padding at the end of a trial, by convention: no line has a negative number
 PADDING = -1
-# numbers of neighbours on each side that are compared with a line, by choice: many at first,
-# against clusters of corrupted numbers, then few, against small errors
+# Numbers of neighbours on each side that are compared with a line, by choice: first many, against
+# clusters of corrupted numbers, then few, against small errors.
 _REACHES = (16, 4, 2)
 
 
 def _shifted(x: Tensor, by: int, fill: int | bool) -> Tensor:
-    """Elements x[..., i + by], and `fill` outside; |by| <= n."""
+    """Elements x[..., i + by], and `fill` outside of x; |by| <= n."""
     edge = torch.full_like(x[..., : abs(by)], fill)
     return torch.cat([x[..., by:], edge], -1) if by > 0 else torch.cat([edge, x[..., :by]], -1)
 
@@ -47,9 +47,10 @@ def _contradictions(offset: Tensor, trusted: Tensor, reach: int, longest_gap: in
 
 
 def _unconfirmed_ends(offset: Tensor, trusted: Tensor) -> Tensor:
-    """First and last accepted line, if the jump to the next one exceeds all jumps inside.
+    """First and last accepted line, if the jump to the next one exceeds all jumps between inner
+    lines.
 
-    They have no neighbour on the outer side to confirm them.
+    These lines have no neighbour on the outer side to confirm them.
     """
     before, after = _nearest(offset, trusted)
     first = trusted & (trusted.cumsum(-1) == 1)
@@ -60,7 +61,9 @@ def _unconfirmed_ends(offset: Tensor, trusted: Tensor) -> Tensor:
 
 
 def _nearest(offset: Tensor, trusted: Tensor) -> tuple[Tensor, Tensor]:
-    """Offsets of the nearest accepted lines before and after; at the ends both of one line."""
+    """Offsets of the nearest accepted lines before and after each line; at the ends both are of one
+    line.
+    """
     n = offset.shape[-1]
     row = torch.arange(n, device=offset.device).expand(offset.shape)
     before = _shifted(torch.where(trusted, row, -1).cummax(-1).values, -1, -1)
@@ -70,12 +73,12 @@ def _nearest(offset: Tensor, trusted: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _enclosed(trusted: Tensor) -> Tensor:
-    """Lines with accepted (or lit) lines on both sides, or accepted themselves."""
+    """True for accepted (or lit) lines, and for lines with such lines on both sides."""
     return (trusted.cumsum(-1) > 0) & (trusted.flip(-1).cumsum(-1).flip(-1) > 0)
 
 
 def _extremes(offset: Tensor, trusted: Tensor) -> tuple[Tensor, Tensor]:
-    """Highest offset of the accepted lines up to each line, and lowest from each line on."""
+    """Highest offset of the accepted lines up to each line, and lowest one from each line on."""
     limit = torch.iinfo(offset.dtype)
     highest = torch.where(trusted, offset, limit.min).cummax(-1).values
     return highest, torch.where(trusted, offset, limit.max).flip(-1).cummin(-1).values.flip(-1)
@@ -99,20 +102,22 @@ def trusted_numbers(offset: Tensor, candidate: Tensor, longest_gap: int) -> Tens
     for reach in _REACHES:
         contradicting = [_contradictions(offset, trusted, reach, longest_gap, sign) for sign in (-1, 1)]
         trusted = trusted & ~torch.stack([2 * no > count for no, count in contradicting]).any(0)
-    # the offsets that remain must not fall anywhere: all inconsistent numbers are dropped
+    # the remaining offsets must not fall anywhere, so that all inconsistent numbers are dropped
     highest, lowest = _extremes(offset, trusted)
     trusted = trusted & (highest <= offset) & (lowest >= offset)
     return trusted & ~_unconfirmed_ends(offset, trusted)
 
 
 def _repeats(lines: Tensor, number: Tensor, present: Tensor) -> Tensor:
-    """Lines with the samples of the line before, (..., line) bool; lines of zeros do not count."""
+    """True for lines with the same samples as the line before, (..., line); lines of zeros do not
+    count.
+    """
     same = (lines[..., 1:, :] == lines[..., :-1, :]).all(-1) & (lines[..., 1:, :] != 0).any(-1)
     return torch.nn.functional.pad(same, (1, 0)) & present
 
 
 def _empty_lines(lines: Tensor, present: Tensor) -> Tensor:
-    """Lines of zeros between other lines, but not before the first or after the last echo."""
+    """True for lines of zeros, except those before the first and after the last echo."""
     lit = (lines != 0).any(-1)
     return present & ~lit & _enclosed(lit)
 
@@ -193,10 +198,10 @@ def line_integrity(
     ok = share >= 0.5
     _check_consistency(ok, trusted, single)
     verified = torch.where(ok[..., None], verified, torch.where(present, row, PADDING))
-    # row 0 is the first received line, whether its own number is right or wrong
+    # row 0 is the first received line, whether its own number is correct or not
     origin = _first(verified) if first_number is None else ok * first_number
     highest, lowest = _extremes(offset, trusted)
-    lossy = highest[..., -1:] > lowest[..., :1]  # lines are lost between the accepted ones
+    lossy = highest[..., -1:] > lowest[..., :1]  # true if lines are lost between the accepted ones
     outside = ok[..., None] & ~_enclosed(trusted) & lossy
     verified = torch.where(outside, PADDING, verified)
     slot = verified - origin[..., None]
@@ -333,9 +338,9 @@ class LineIntegrity(Stage):
             bit), and the Estimate of `line_integrity`.
 
         Raises:
-            ValueError: If the numbers do not fit the lines or are not integers, `longest_gap` is
-                less than one, fewer than half of the numbers are accepted in every trial, or the
-                grid holds none of the lines.
+            ValueError: If the numbers do not fit the lines or are not integers, or `longest_gap` is
+                less than one. Also if fewer than half of the numbers are accepted in every trial,
+                or the grid holds none of the lines.
         """
         plan = line_integrity(signal.data, line_number, **self.options)
         source = plan.info["source"]

@@ -17,8 +17,8 @@ from torchsar.core import cholesky_factor, power_of
 from torchsar.repair.contamination import LASTING, anything, block_sums, excess_of, line_spectra, stands_out
 from torchsar.repair.tones import Tone, window_sums
 
-# lines that share one spectrum, by choice: more lines estimate it better, fewer follow a changing
-# interferer
+# lines that have one spectrum in common, by choice: more lines estimate it better, fewer follow a
+# changing interferer
 _GROUP = 32
 
 
@@ -66,14 +66,14 @@ def subtract_band(lines: Tensor, touched: Tensor, density: Tensor) -> Tensor:
     fill = -n_pulse % _GROUP
     x, floor = (pad(part, (0, 0, 0, fill)).unflatten(-2, (-1, _GROUP)) for part in (lines, density))
     on = pad(touched, (0, fill)).unflatten(-1, (-1, _GROUP))
-    # spectrum over the density at half cells, mean of the marked lines of a group; one line of
-    # every group at a time takes a fraction of the memory of all at once
+    # Spectrum over density at half cells, averaged over the marked lines of a group. The loop over
+    # the lines of a group takes a fraction of the memory of all lines at once.
     total = torch.zeros(*x.shape[:-2], 2 * n, dtype=x.real.dtype, device=x.device)
     for k in range(_GROUP):
         fine = floor[..., k, :].repeat_interleave(2, -1)
         total = total + on[..., k, None] * excess_of(line_spectra(x[..., k, :].detach(), 2), fine)
     excess = total / on.sum(-1).clamp_min(1)[..., None]
-    # the band around the strongest half cell, and interferer over clutter there
+    # the band around the strongest half cell, and the ratio of interferer to clutter there
     m = 2 * max(8, round(n / 32))
     smooth = avg_pool1d(pad(excess.flatten(0, -2)[:, None], (2, 2), mode="circular"), 5, 1)[:, 0].reshape(excess.shape)
     first = (smooth.argmax(-1) - m // 2) % (2 * n)
@@ -88,13 +88,13 @@ def _process(x: Tensor, index: Tensor, ratio: Tensor) -> Tensor:
 
     x: (..., group, line, n); index and ratio: (..., group, m), half cells and their spectrum over
     white clutter. The prior covariance is C = F diag(ratio) F^H with F from the inverse DFT of 2 n
-    points, and C (C + 1)^-1 x = F q (1 + q F^H F q)^-1 q F^H x with q^2 = ratio: an m x m solve per
-    group.
+    points. The mean is C (C + 1)^-1 x = F q (1 + q F^H F q)^-1 q F^H x with q^2 = ratio, which
+    needs one m x m solution per group.
     """
     n, m = x.shape[-1], ratio.shape[-1]
     index = index[..., None, :].expand(*x.shape[:-1], m)
-    # in double precision: the condition of the small system is the power of the interferer over
-    # that of the clutter
+    # double precision, because the condition of the small system is the ratio of the power of the
+    # interferer to that of the clutter
     root, wide = torch.sqrt(ratio.to(torch.float64)), torch.complex128
     projected = torch.fft.fft(x, 2 * n, norm="ortho").gather(-1, index).to(wide) * root[..., None, :]
     lag = torch.arange(m, device=x.device)

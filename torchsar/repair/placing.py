@@ -93,14 +93,14 @@ class LinePlan:
 
     @property
     def missing(self) -> Tensor:
-        """Rows of the grid that no line is near, bool (row,)."""
+        """Rows of the grid that have no line near them, bool (row,)."""
         empty = torch.ones(self.rows, dtype=torch.bool)
         empty[self.time.round().long()] = False
         return empty
 
     @property
     def further_samples(self) -> int:
-        """Number of samples that the grid has more than a line."""
+        """Number of samples by which the grid is longer than a line."""
         return int(self.cells.max().ceil())
 
     def needed(self, first: int, last: int, taps: int = 24) -> tuple[int, int]:
@@ -118,9 +118,9 @@ class LinePlan:
     def doppler_turns(self, lines: Tensor, first: int) -> float:
         """Estimate the Doppler centroid, in cycles per pulse interval, from lines of uneven times.
 
-        Products of adjacent lines turn by the centroid times their distance in time. Where these
-        distances differ, one centroid fits them all, without ambiguity; where they differ too
-        little to tell, that nearest to the pointing of the radar is taken.
+        The phases of products of adjacent lines grow with the centroid times their distance in
+        time. Where these distances differ, one centroid fits them all, without ambiguity. Where
+        they hardly differ, the centroid nearest to the pointing of the radar is taken.
 
         Args:
             lines: Recorded lines, (line, range), aligned in range.
@@ -137,7 +137,7 @@ class LinePlan:
         step, products = (x[: len(x) // blocks * blocks].view(blocks, -1) for x in (step, products))
         base = float(products.sum().angle()) / (2 * torch.pi)
         turns = base + torch.round(nominal - base + torch.arange(-most, most + 1, dtype=torch.float64))
-        # by modulus, so that the centroid of each block may be its own
+        # moduli are added, so that each block may have a centroid of its own
         score = torch.stack([(products * unit_phasor(-f * step, products.dtype)).sum(-1).abs() for f in turns.tolist()])
         power = products.abs().sum(-1)
         gain = (score - score[most]) / (power + 1e-3 * power.max()).clamp_min(1e-300)
@@ -148,7 +148,7 @@ class LinePlan:
         return float(near[int(torch.stack(fit).argmax())])
 
     def placed(self, lines: Tensor, start: int, first: int, last: int, turns: float) -> Tensor:
-        """Put recorded lines on rows of the grid.
+        """Interpolate recorded lines to rows of the grid, or place them there.
 
         Args:
             lines: The recorded lines that `needed` names, (line, range), aligned in range.
@@ -177,8 +177,8 @@ class LinePlan:
         return found
 
     def aligned(self, lines: Tensor, start: int) -> Tensor:
-        """Move the samples of recorded lines to the window of the grid, by transforms where that is
-        a fraction of a sample.
+        """Move the samples of recorded lines to the window of the grid. Moves by a fraction of a
+        sample are made by Fourier transforms.
 
         Args:
             lines: Recorded lines, (line, range).
@@ -243,13 +243,14 @@ def regular_lines(recording: Recording) -> Recording:
     return replace(recording, signal=replace(recording.signal, data=rows, axes=axes), aux=side)
 
 
-# side data of single lines that a regular grid does not have
+# side data of single lines, which a regular grid does not have
 _PER_LINE = ("line_number", "line_time_s", "window_start_m")
 
 
 def _numbered(number: Tensor) -> Tensor:
-    """Times of lines by their numbers, in pulse intervals since the first; numbers that contradict
-    their neighbours follow from these.
+    """Times of lines in pulse intervals since the first one, from their numbers.
+
+    Numbers that contradict their neighbours are replaced by what follows from these.
     """
     index = torch.arange(len(number))
     trusted = trusted_numbers(number - index, torch.ones_like(index, dtype=torch.bool), 100_000)
@@ -267,10 +268,12 @@ def _numbered(number: Tensor) -> Tensor:
 def _interpolation(
     time: Tensor, out: Tensor, turns: float, band: float = 0.9, taps: int = 24, noise: float = 1e-3
 ) -> tuple[Tensor, int]:
-    """Weights of lines of uneven times for rows of a grid, the best for a flat band about the
-    centroid with white noise (Wiener), (row, line), and the number of the first line.
+    """Weights (row, line) that interpolate lines of uneven times to rows of a grid, and the number
+    of the first line.
 
-    band: share of the pulse rate; noise: its power relative to the signal, both by choice.
+    They are the best ones for a spectrum that is flat in a band about the centroid, with white
+    noise (Wiener). band: share of the pulse rate; noise: its power relative to the signal, both by
+    choice.
     """
     middle = torch.searchsorted(time, out)
     index = middle[:, None] + torch.arange(-(taps // 2), taps - taps // 2)

@@ -18,8 +18,8 @@ from torch import Tensor
 from torchsar.core import Signal, Stage, checked_samples, cis, legendre, real_dtype, refuse_non_finite_values
 from torchsar.radar import StripmapRadar
 
-# Samples of a response, by choice: odd, so that u = 0 is one of them, and about 80 for each period
-# of the highest Legendre degree (40) at the middle of the band.
+# Number of samples of a response, by choice. It is odd, so that u = 0 is one of them. There are
+# about 80 for each period of the highest Legendre degree (40) at the middle of the band.
 GRID = 1025
 
 
@@ -175,7 +175,7 @@ def estimate_amplitude_response(power: Tensor, expected: Tensor, band: float, or
 
 
 def _binned(power: Tensor, band: float, bins: int) -> Tensor:
-    """Mean over equal bins of u in the band, (..., bins)."""
+    """Mean of a power spectrum over equal bins of u in the band, (..., bins)."""
     u = band_axis(power.shape[-1], band, power.device)
     inside = u.abs() < 1
     if int(inside.sum()) < bins:

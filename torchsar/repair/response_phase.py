@@ -35,12 +35,12 @@ from torchsar.repair.response import (
     unit_legendre,
 )
 
-# Highest Legendre degrees of the stages of a fit, by choice: a large smooth phase first, then
-# ripple of up to about 20 periods over the band.
+# Highest Legendre degrees of the stages of a fit, by choice. A large smooth phase is found first,
+# then ripple of up to about 20 periods over the band.
 ORDERS = (2, 4, 8, 16, 40)
-# Ratio of the power of a peak to that of the noise at which its weight is one half, by choice.
+# ratio of the power of a peak to that of the noise at which its weight is one half, by choice
 _FULL = 100.0
-# Windows computed at once, by measurement: so few that they stay in the cache of a processor.
+# number of windows that are computed at once, by measurement: so few that they stay in the cache
 _BLOCK = 128
 
 
@@ -82,7 +82,7 @@ def brightest_windows(image: Tensor, points: int, width: int, apart: int = 8) ->
 
 
 def _running_maximum(x: Tensor, reach: int) -> Tensor:
-    """Largest of the values, 0 or more, up to `reach` samples away along the last dimension."""
+    """Largest one of zero and the values up to `reach` samples away, along the last dimension."""
     x, span = torch.nn.functional.pad(x, (reach, reach)), 1
     while span < 2 * reach + 1:
         more = min(span, 2 * reach + 1 - span)
@@ -129,15 +129,17 @@ def halved(weight: Tensor, line: Tensor) -> Tensor:
     """
     used = weight > 0
     place = torch.where(used, line, line.amax() + 1)
-    first = torch.searchsorted(place.sort(-1).values, place)  # windows in lines before
+    first = torch.searchsorted(place.sort(-1).values, place)  # number of windows in lines before
     quarter = 4 * first // used.sum(-1, keepdim=True).clamp_min(1)
     inner = (quarter == 1) | (quarter == 2)
     return torch.cat([weight * ~inner, weight * inner])
 
 
 def _spectra(windows: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Spectra of unit energy (window, n) of the windows (trial, point, n) with a weight above zero,
-    complex128; their weights, with the sum 1 in each trial; and their trials, in rising order.
+    """Spectra of unit energy (window, n) of those windows (trial, point, n) that have a weight
+    above zero, complex128.
+
+    Also returns their weights, with the sum 1 in each trial, and their trials, in rising order.
     """
     used = (weight > 0) & (windows != 0).any(-1)
     spectra = _transformed(windows[used].to(torch.complex128))
@@ -177,7 +179,9 @@ def window_entropy(spectra: tuple[Tensor, Tensor, Tensor], phase_rad: Tensor) ->
 
 
 def _entropy_slope(turned: Tensor) -> tuple[Tensor, Tensor]:
-    """Entropy (window,) of spectra (window, n), and its slope (window, n) over a removed phase."""
+    """Entropy (window,) of the range responses with given spectra (window, n), and its slope
+    (window, n) by a phase that is removed.
+    """
     n = turned.shape[-1]
     y = torch.fft.ifft(
         torch.cat([turned[:, : n // 2], torch.zeros_like(turned), turned[:, n // 2 :]], -1), norm="ortho"
@@ -290,7 +294,7 @@ def estimate_response_sharpest(
 
 
 def _rows(image: Tensor, name: str, valid: int | None) -> Tensor:
-    """Valid columns of images in a row, (trial, azimuth, range), of unit level."""
+    """Images in a row, (trial, azimuth, range), of unit level, with the valid columns only."""
     image = checked_samples(image, name, "azimuth, range").detach()[..., :valid]
     return unit_level(image.reshape(-1, *image.shape[-2:]))
 
@@ -298,7 +302,9 @@ def _rows(image: Tensor, name: str, valid: int | None) -> Tensor:
 def _windows(
     rows: Tensor, phase_rad: Tensor, band: float, points: int, width: int, apart: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Windows about the brightest points after removal of a phase, their lines and weights."""
+    """Windows around the brightest points after removal of a phase, their lines, and
+    their weights.
+    """
     sharper = correct_response(rows, phase_rad, None, band) if bool(phase_rad.any()) else rows
     width = min(width, rows.shape[-1] // 4 * 2)
     windows, line = brightest_windows(sharper, points, width, min(apart, width // 2))
@@ -306,10 +312,12 @@ def _windows(
 
 
 def _estimate(phase_rad: Tensor, image: Tensor, fit: tuple[Tensor, Tensor, Tensor, Tensor, float] | None) -> Estimate:
-    """Estimate of a phase response (trial, GRID), assessed from the fit of two halves of windows.
+    """Estimate of a phase response (trial, GRID), assessed from the fit of two halves of the
+    windows.
 
-    fit: Windows and weights of the halves (2 trial, ...), their coefficients, the weights of all
-    windows, which tell their peaks over the noise, and the band; None for no assessment.
+    fit: Windows and weights of the halves (2 trial, ...); their coefficients; the weights of all
+    windows, from which the ratio of their peaks to the noise follows; and the band. None for no
+    assessment.
     """
     trials = image.shape[:-2]
     value = {"phase_rad": phase_rad.reshape(*trials, GRID), "amplitude": torch.ones(*trials, GRID).to(phase_rad)}
@@ -322,8 +330,8 @@ def _estimate(phase_rad: Tensor, image: Tensor, fit: tuple[Tensor, Tensor, Tenso
     def slope(coefficients: Tensor) -> Tensor:
         return window_entropy(spectra, coefficients @ basis)[1] @ basis[count:].mT
 
-    # a window whose peak has s times the power of the noise gives each coefficient a variance of
-    # 1 / (2 s)
+    # a window whose peak has s times the power of the noise contributes a variance of 1 / (2 s) to
+    # each coefficient
     s = _FULL * strength / (1 - strength)
     bound = (count / (2 * s.sum(-1))).sqrt()
     sided = (weights.sum(-1) > 0).reshape(2, -1).all(0)
@@ -362,7 +370,8 @@ def point_average_coefficients(
     spectra = torch.fft.fftshift(_transformed(spectra), dim=-1)[:, inside]
     spectra = spectra / torch.linalg.vector_norm(spectra, dim=-1, keepdim=True)
     average = spectra.new_zeros(windows.shape[0], spectra.shape[-1])
-    first = torch.diff(trial, prepend=trial.new_full((1,), -1)) > 0  # window of each trial
+    # True at the first window of each trial
+    first = torch.diff(trial, prepend=trial.new_full((1,), -1)) > 0
     average[trial[first]] = spectra[first]
     for _ in range(rounds if trial.numel() else 0):
         spectra = _align(spectra, average[trial])
@@ -376,7 +385,9 @@ def point_average_coefficients(
 
 
 def _align(spectra: Tensor, reference: Tensor) -> Tensor:
-    """Spectra (window, n), with linear and constant phase aligned with the references."""
+    """Align the linear and the constant phase of spectra (window, n) with those of the
+    references.
+    """
     n = 8 * spectra.shape[-1]
     correlation = torch.fft.fft(spectra * reference.conj(), n)
     index = power_of(correlation).argmax(-1, keepdim=True)

@@ -3,15 +3,15 @@
 The image is split by Doppler into a few sub-looks. Every pixel of every sub-look is modelled as
 independent zero-mean noise, whose power v varies slowly over the image. The most probable missing
 lines minimise the sum of |pixel|^2 / v over all pixels of all sub-looks. This is a linear system in
-the missing lines alone, solved by conjugate gradients. Then v is estimated anew from the
-reconstructed image, and the system is solved again.
+the missing lines alone, solved by conjugate gradients. Then v is estimated again from the
+reconstructed image, and the system is solved again. The first estimate (`bright_fill`) keeps only
+the bright part of the image; it finds points but no texture.
 
-The first estimate (`bright_fill`) keeps only the bright part of the image; it finds points but no
-texture. The model is better on recorded data for three reasons. A local power estimate follows
-texture, which a threshold does not. Conjugate gradients converge faster than plain iteration. As v
-differs between sub-looks, the model accounts for properties of the azimuth spectrum such as band
-edges, noise floor, drift of the Doppler centroid over the scene, and apertures cut by the ends of
-the recording.
+The model is better on recorded data for three reasons. A local power estimate follows texture,
+which a threshold does not. Conjugate gradients converge faster than plain iteration. As v differs
+between sub-looks, the model accounts for properties of the azimuth spectrum such as band edges,
+noise floor, drift of the Doppler centroid over the scene, and apertures cut by the ends of the
+recording.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from torchsar.core import (
 from torchsar.focus.stored_omega_k import InvertibleOmegaK, all_pass
 from torchsar.radar import StripmapRadar
 
-# chosen: relative change in power of the missing lines, below which they count as settled
+# relative change in power of the missing lines below which they no longer change, by choice
 _SETTLED = 1e-5
 
 
@@ -208,7 +208,8 @@ class IncompleteLines:
         if self._whole:
             return make(slice(None))
         n, beside = out.shape[dim], max(1, self.received.numel() // self.received.shape[dim])
-        # measured: reading and writing of fewer columns takes longer; four arrays share the cache
+        # The least number of columns was measured: with fewer, reading and writing takes longer.
+        # Four arrays share the cache.
         least = 32 if dim == -1 else 1
         size = block_bytes_of(out.device) // (4 * beside * self.received.element_size())
         step = max(1, size // least) * least
@@ -231,7 +232,8 @@ class IncompleteLines:
 def _spaced(like: Tensor, shape: tuple[int, ...]) -> Tensor:
     """Empty array whose rows lie an odd number of cache lines apart.
 
-    At a distance of a power of two, the samples of a column would share a few places in the cache.
+    If the distance were a power of two, the samples of a column would share a few places in the
+    cache.
     """
     line = 64 // like.element_size()  # a cache line has 64 bytes
     wide = like.new_empty((*shape[:-1], line * (-(-shape[-1] // line) | 1)))
@@ -257,7 +259,7 @@ class SubLooks:
         self.windows = windows[..., None, :].to(real)
         looks, n = len(windows), windows.shape[-1]
         self.step = max(q for q in range(1, max(1, looks // 2) + 1) if n % q == 0)
-        # the inverse FFT of the folded spectrum is larger by the step
+        # the inverse FFT of the folded spectrum is larger by the factor `step`
         self.share = self.step**2 * windows.square().mean(-1)[..., None, None].to(real)
 
     def _pixels(self, spectra: Tensor, window: Tensor) -> Tensor:
@@ -351,7 +353,7 @@ def bright_fill(
     active = torch.ones_like(missing[..., :1, :1], dtype=torch.bool)
     for _ in range(steps):
         spectra = scene.spectra(missing)
-        # mean power of the pixels of the image
+        # lowest threshold: a multiple of the mean power of the pixels of the image
         energy = scene.energy + power_of(missing.detach()).sum((-2, -1), keepdim=True)
         lowest = last**2 * (energy / (scene.received.shape[-2] ** 2 * scene.received.shape[-1]))
         if threshold is None:
@@ -452,6 +454,6 @@ def sparse_fill(
         weight = power.mean((0, -2, -1), keepdim=True) * inverse
         residual = -model.precision(found, weight, received=True)
         found = conjugate_fill(lambda y, w=weight: model.precision(y, w), found, residual, steps)
-        # variance of a missing line given all others, spread over the image
+        # variance of a missing line given all others, spread over the pixels of the image
         unexplained = missing_share * (1 / inverse.mean((0, -1), keepdim=True))[0]
     return torch.where(mask[..., None], scene.lines(found) * level, lines)

@@ -54,26 +54,32 @@ class Tone:
 
 
 def _of_phase(n: int) -> tuple[float, float]:
-    """Frequency and drift that one radian of the first and second Legendre polynomial add."""
+    """Frequency and drift that one radian of the first and of the second Legendre polynomial adds
+    to a tone of n samples.
+    """
     return math.sqrt(3) / (math.pi * n), 6 * math.sqrt(5) / (math.pi * n * n)
 
 
 def _coarse_offset(blocks: Tensor) -> tuple[Tensor, Tensor]:
-    """Frequency offset, and change of the frequency in a line, in cells of 1 / n cycles per
-    sample, (...,) each, that give a demodulated tone the highest spectral peak.
+    """Frequency offset, and change of the frequency within a line, for which a demodulated tone has
+    the highest spectral peak.
+
+    Both are in cells of 1 / n cycles per sample, (...,) each.
     """
     count = blocks.shape[-1]
     u = torch.linspace(-0.5, 0.5, count, dtype=torch.float64, device=blocks.device)
     offset = torch.fft.fftfreq(2 * count, 1 / (2 * count), dtype=torch.float64, device=blocks.device) / 2
     best = torch.full(blocks.shape[:-1], -1.0, dtype=blocks.real.dtype, device=blocks.device)
     cells = sweep = torch.zeros_like(best, dtype=torch.float64)
-    # drifts of up to 48 cells and errors of up to 12 cells, by choice: the cost grows with both
+    # drifts of up to 48 cells and errors of up to 12 cells, by choice, because the time grows with
+    # both
     for cells_per_line in sorted(range(-48, 49, 2), key=abs):
         chirp = unit_phasor(-0.5 * cells_per_line * u.square(), blocks.dtype)
         # the strongest cell of a drifting tone may be any cell that it passes
         near = offset.abs() <= 12 + abs(cells_per_line) / 2
         value, index = (torch.fft.fft(blocks * chirp, 2 * count).abs() * near).max(-1)
-        # a drift counts only if it collects clearly more energy: it costs a parameter
+        # a drift is accepted only if it collects clearly more energy, because it is one more
+        # parameter
         better = value > best * (1.0 if cells_per_line == 0 else 1.02)
         best, cells = torch.where(better, value, best), torch.where(better, offset[index], cells)
         sweep = torch.where(better, float(cells_per_line), sweep)
@@ -95,15 +101,18 @@ def _fit_tone(lines: Tensor, cell: Tensor, present: Tensor, density: Tensor) -> 
     energy = power_of(blocks.sum(-1)) / n
     tiny, count = torch.finfo(energy.dtype).tiny, blocks.shape[-1]
     noise = torch.sqrt(density / (2 * energy.clamp_min(tiny))).to(torch.float64)
-    # a chirp has a given frequency in few blocks only, whereas a tone fills all of them; the
-    # coherent share of the energy expected of a tone with z = energy / density is z / (z + count)
+    # A chirp has a given frequency in few blocks only, whereas a tone fills all of them. A tone
+    # with z = energy / density is expected to have the coherent share z / (z + count) of the
+    # energy.
     coherent = power_of(blocks.sum(-1)) / (count * power_of(blocks).sum(-1).clamp_min(tiny))
     z = energy / density.clamp_min(tiny)
     return replace(tone, present=present & (coherent > LASTING * z / (z + count)), noise_rad=noise)
 
 
 def _refined(lines: Tensor, tone: Tone, steps: int) -> tuple[Tone, Tensor]:
-    """Tone after Gauss-Newton steps on the block sums of one demodulation, and those sums."""
+    """Refine a tone by Gauss-Newton steps on the block sums of one demodulation, and return the
+    tone and those sums.
+    """
     blocks = block_sums(lines * tone.phasor(lines).conj())
     count, n = blocks.shape[-1], lines.shape[-1]
     middle = (2 * torch.arange(count, dtype=torch.float64, device=lines.device) + 1) / count - 1
@@ -166,8 +175,9 @@ def find_tones(lines: Tensor, density: Tensor, position: Tensor, most: int, thre
 
 
 def _refit(lines: Tensor, tones: list[Tone], position: Tensor) -> list[Tone]:
-    """Tones fitted again where a line holds several of them, each to the line without the others,
-    with frequencies and drifts averaged over neighbouring lines.
+    """Fit the tones again where a line holds several of them, each to the line without the others.
+
+    Frequencies and drifts are averaged over neighbouring lines.
     """
     n, tones = lines.shape[-1], list(tones)
     shared = sum((tone.present.int() for tone in tones), torch.zeros_like(position)) > 1
@@ -212,8 +222,8 @@ def _smooth_track(value: Tensor, std: Tensor, present: Tensor, position: Tensor)
     """Smooth one value per line by local straight-line fits where these fit within the noise.
 
     The window of the fits grows threefold in each step. Each line keeps the fit with the widest
-    window whose residuals are no larger than predicted; without any, as where a tone jumps from
-    line to line, it keeps its own value. All arguments have the shape (..., pulse).
+    window whose residuals are no larger than predicted. If there is none, as where a tone jumps
+    from line to line, it keeps its own value. All arguments have the shape (..., pulse).
     """
     weight = torch.where(present, 1 / std.square().clamp_min(1e-60), 0.0)
     weight = weight / weight.amax(-1, keepdim=True).clamp_min(1e-300)

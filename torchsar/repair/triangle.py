@@ -162,7 +162,9 @@ def canonical_ramps(sweeps: Tensor, radar: TriangularLadar, nearer: bool) -> Ten
 
 
 def _cut_joined(line: Tensor, start: Tensor, n_period: int, radar: TriangularLadar) -> Tensor:
-    """Periods (..., K', period) of a contiguous record (..., 1, n) from sample `start` on."""
+    """Cut periods (..., K', period) out of a contiguous record (..., 1, n), from sample
+    `start` on.
+    """
     period = 2 * radar.sweep_samples
     if line.shape[-1] != n_period * period:
         raise ValueError(
@@ -180,7 +182,7 @@ def _cut_joined(line: Tensor, start: Tensor, n_period: int, radar: TriangularLad
 
 
 def _cut_inside(blocks: Tensor, start: Tensor, radar: TriangularLadar) -> Tensor:
-    """Periods (..., K, period) of blocks (..., K, n) from sample `start` on."""
+    """Cut periods (..., K, period) out of blocks (..., K, n), from sample `start` on."""
     period, n = 2 * radar.sweep_samples, blocks.shape[-1]
     if period > n or host_value(((start < 0) | (start + period > n)).any(), False):
         allowed = (
@@ -196,7 +198,7 @@ def _cut_inside(blocks: Tensor, start: Tensor, radar: TriangularLadar) -> Tensor
 
 
 def _taken(lines: Tensor, start: Tensor, n: int) -> Tensor:
-    """Samples of every line (..., line, samples) from index `start` (...,) on, n of them."""
+    """Take n samples of every line (..., line, samples) from index `start` (...,) on."""
     if start.ndim == 0:
         return lines[..., start + torch.arange(n, device=lines.device)]
     index = start[..., None, None] + torch.arange(n, device=lines.device)
@@ -364,7 +366,7 @@ class SplitSweeps(Stage):
             found = find_trigger(signal.data, radar, contiguous, self.nearer, assess=self.assess)
             estimated = found["trigger_s"] + time.start
             found, fitting = replace(found, value={"trigger_s": estimated}), estimated
-            if not contiguous:  # limited so that a period fits its block
+            if not contiguous:  # the trigger is limited so that a period fits into its block
                 room = max(0, time.n - 2 * radar.sweep_samples)
                 fitting = estimated.clamp(
                     time.start - 0.5 / radar.sample_rate_hz, time.start + (room - 0.6) / radar.sample_rate_hz

@@ -55,10 +55,11 @@ def sweep_error_s(calibration: Tensor, radar: TriangularLadar, delay_s: float) -
     calibration = calibration.conj() if radar.dechirp_sign == "echo_conj_lo" else calibration
     if not delay_s > 0:
         raise ValueError(f"delay_s of the calibration channel must be positive, got {delay_s} s")
-    # phase K u tc of a linear sweep in turns
+    # phase K u tc of a linear sweep in cycles
     tone = _sign(calibration) * (radar.chirp_rate_hz_s * delay_s * radar.fast_time_axis().values(calibration.device))
     x = calibration.to(torch.complex128) * unit_phasor(-tone, torch.complex128)[..., None, :]
-    # mean over the periods, each rotated to the phase of the first, and its continuous phase
+    # mean over the periods, each rotated to the phase of the first, and the unwrapped phase of the
+    # mean
     turn = (x * x[..., :1, :].conj()).sum(-1, keepdim=True)
     phasor = (x * (turn.conj() / turn.abs().clamp_min(1e-300))).mean(-2)
     steps = torch.angle(phasor[..., 1:] * phasor[..., :-1].conj())
@@ -69,12 +70,14 @@ def sweep_error_s(calibration: Tensor, radar: TriangularLadar, delay_s: float) -
 
 
 def _sign(like: Tensor) -> Tensor:
-    """+1 for the up ramp and -1 for the down ramp, (2, 1)."""
+    """Sign +1 for the up sweep and -1 for the down sweep, (2, 1)."""
     return torch.tensor([[1.0], [-1.0]], dtype=torch.float64, device=like.device)
 
 
 def _shifted(error: Tensor, radar: TriangularLadar, delay_s: float) -> Tensor:
-    """Error at u from one that is known at u - tc / 2, from its first complete sample on."""
+    """Error at the time u from an error that is known at u - tc / 2, from its first complete sample
+    on.
+    """
     lost, half = math.ceil(delay_s * radar.sample_rate_hz - 1e-9), delay_s * radar.sample_rate_hz / 2
     if lost > error.shape[-1] // 2:
         raise ValueError(
@@ -86,7 +89,9 @@ def _shifted(error: Tensor, radar: TriangularLadar, delay_s: float) -> Tensor:
 
 
 def _sampled(x: Tensor, instant: Tensor) -> Tensor:
-    """Cubic interpolation of x (..., n) at fractional indices (..., m), linear beyond its ends."""
+    """Interpolate x (..., n) at fractional indices (..., m) by cubics, and linearly beyond its
+    ends.
+    """
     n = x.shape[-1]
     inside = instant.clamp(0, n - 1)
     first = torch.floor(inside).long().clamp(1, n - 3) - 1
@@ -184,7 +189,9 @@ def _check_sweeps(x: Tensor, what: str, periods: str, n: int) -> None:
 
 
 def _instants(error_s: Tensor, radar: TriangularLadar, dtau_s: float, steps: int = 4) -> Tensor:
-    """Fractional index at which w(u - dtau / 2) + dtau / 2 equals each grid sample, (..., 2, N)."""
+    """Fractional index (..., 2, N) at which w(u - dtau / 2) + dtau / 2 equals each sample of the
+    grid.
+    """
     error = error_s * radar.sample_rate_hz
     grid = torch.arange(error.shape[-1], dtype=torch.float64, device=error.device)
     half = dtau_s / 2 * radar.sample_rate_hz
@@ -195,7 +202,7 @@ def _instants(error_s: Tensor, radar: TriangularLadar, dtau_s: float, steps: int
 
 
 def _resampled(x: Tensor, instant: Tensor, points: int, band: float) -> Tensor:
-    """x (..., 2, K, N) at fractional indices (..., 2, N) of its last dimension."""
+    """Interpolate x (..., 2, K, N) at fractional indices (..., 2, N) of its last dimension."""
     first = (torch.floor(instant.detach()).long() - (points // 2 - 1)).clamp(0, x.shape[-1] - points)
     index = first[..., None] + torch.arange(points, device=x.device)
     weights = band_limited_weights(index - instant[..., None], band).to(x.real.dtype)

@@ -41,17 +41,19 @@ from torchsar.radar import TriangularLadar
 from torchsar.repair.analytic import delayed
 from torchsar.repair.assess import assess_trigger
 
-# Sweeps that are used in the search for turning points, by choice: more are more accurate but take
-# more time.
+# number of sweeps that are used in the search for turning points, by choice: more are more accurate
+# but take more time
 MAX_WINDOWS = 192
-# Steps per half sample in which the symmetry of the record is computed, enough for a linear
-# interpolation.
+# steps per half sample in which the symmetry of the record is computed, enough for linear
+# interpolation
 _FINE = 8
 
 
 @dataclass(frozen=True)
 class _Windows:
-    """Complex lines (..., line, n) and their sweeps from o + j N on, o in 0..N + 2 margin."""
+    """Complex lines (..., line, n) and their sweeps, which begin at o + j N with o in 0..N + 2
+    margin.
+    """
 
     lines: Tensor
     radar: TriangularLadar
@@ -59,12 +61,12 @@ class _Windows:
 
     @property
     def count(self) -> int:
-        """Number of sweeps of one line, even."""
+        """Even number of sweeps in one line."""
         n = self.radar.sweep_samples
         return ((self.lines.shape[-1] - 2 * self.margin) // n - 1) // 2 * 2
 
     def steps(self) -> tuple[int, int]:
-        """Steps of lines and of pairs of sweeps that leave about MAX_WINDOWS sweeps."""
+        """Steps over lines and over pairs of sweeps that leave about MAX_WINDOWS sweeps."""
         pairs, n_line = self.count // 2, self.lines.shape[-2]
         step = max(1, pairs * n_line * 2 // MAX_WINDOWS)
         return min(step, n_line), min(pairs, max(1, step // min(step, n_line)))
@@ -156,7 +158,8 @@ def find_trigger(
     base = torch.round(middle).long().clamp(0, n + 2 * windows.margin)
     cycles, value = _find_tones(windows.cut(base[..., None], every=True).squeeze(-4), max(2, n // 32))
     turns = torch.angle(value[..., 0]) / (2 * math.pi)
-    # strongest tones of even and odd sweeps, (..., line, pair); those of a complex detector
+    # strongest tones of even and odd sweeps, (..., line, pair), with the signs of a complex
+    # detector
     side = 1 if is_complex else -1
     even, odd = cycles[..., 0::2, 0], side * cycles[..., 1::2, 0]
     gap, doppler = even - odd, (even + odd) / 2
@@ -168,8 +171,8 @@ def find_trigger(
     meeting = _meeting(phase_difference, middle_gap / 2, middle - base)
     symmetry = _symmetry(windows, base, _without_outliers(doppler.flatten(-2)), is_complex)
     fine, fringe_sigmas, symmetric = _fringe(windows, base, (cycles, value), meeting, middle_gap.abs() / 2, symmetry)
-    # the tones have equal phase half a transient, f+ / (2 K), after the turning point of the
-    # reference; before it if the scene is nearer
+    # The tones have equal phase half a transient, f+ / (2 K), after the turning point of the
+    # reference, or before it if the scene is nearer.
     per_cycle = radar.sample_rate_hz**2 / radar.chirp_rate_hz_s / 2 * (-1 if nearer else 1)
     half_transient = middle_gap.abs() / 2 * per_cycle
     start = base + fine - 0.5 - half_transient + torch.where(even_is_up, 0, n)
@@ -188,7 +191,9 @@ def find_trigger(
 
 
 def _turning_by_stft(windows: _Windows) -> tuple[Tensor, Tensor]:
-    """Sample of the turning points, margin..margin + N, and the drop of concentration."""
+    """Sample of the turning points, margin..margin + N, and the drop of the spectral concentration
+    there.
+    """
     n = windows.radar.sweep_samples
     hop, width = max(1, n // 32), max(8, n // 8)
     lines = windows.lines[..., :: windows.steps()[0], :]
@@ -229,7 +234,8 @@ def _apex(windows: _Windows, near: Tensor, reach: int) -> Tensor:
     start = (near[..., None] + offset).clamp(0, windows.radar.sweep_samples + 2 * windows.margin)
     mean = torch.stack([_sharpness(windows, first) for first in start.split(1, -1)], -1).unflatten(-1, (2, 6))
     side = offset.to(torch.float64).unflatten(0, (2, 6))
-    terms = torch.linalg.pinv(torch.stack([torch.ones_like(side), side], -1))  # (side, term, offset)
+    # least-squares weights (side, term, offset)
+    terms = torch.linalg.pinv(torch.stack([torch.ones_like(side), side], -1))
     (left, rise), (right, fall) = ((mean[..., i, None, :] * terms[i]).sum(-1).unbind(-1) for i in (0, 1))
     top = (right - left) / (rise - fall).clamp_min(1e-300)
     return near.to(torch.float64) + top.clamp(-8 * step, 8 * step)
@@ -267,7 +273,7 @@ def _peak_cycles(x: Tensor) -> Tensor:
 
 
 def _meeting(phase_difference: Tensor, plus_cycles: Tensor, expected: Tensor) -> Tensor:
-    """Sample offset nearest to the expected one at which even and odd tones have one phase."""
+    """Sample offset nearest to the expected one at which even and odd tones have equal phase."""
     phasor = torch.polar(torch.ones_like(phase_difference), 2 * math.pi * phase_difference).mean((-2, -1))
     turns, twice = torch.angle(phasor) / (2 * math.pi), 2 * plus_cycles
     known = twice.abs() > 1e-6
@@ -284,18 +290,20 @@ def _fringe(
     plus_cycles: Tensor,
     symmetry: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Fringe around `expected` at which samples change from even to odd tones, and its certainty.
+    """Fringe around `expected` at which the samples change from even to odd tones, its certainty,
+    and the symmetry there.
 
-    The sum of |x - odd|^2 - |x - even|^2 up to a boundary is largest at the true one; its standard
+    The sum of |x - odd|^2 - |x - even|^2 up to a boundary is largest at the true one. Its standard
     deviation follows from the scatter between pairs of sweeps. Fringes about which the record is
-    clearly less symmetric than about another instant are excluded: with many scatterers, the
-    strongest tones do not describe the samples. Offsets are in samples from base, the certainty in
-    standard deviations. The third result is the symmetry at the fringe. symmetry: see `_symmetry`.
+    clearly less symmetric than about another instant are excluded, because with many scatterers the
+    strongest tones do not describe the samples. Offsets are in samples from base, the certainty is
+    in standard deviations. symmetry: see `_symmetry`.
     """
     n, reach = windows.radar.sweep_samples, windows.margin
     around = windows.cut((base - reach)[..., None], every=True).squeeze(-4)[..., 1::2, : 2 * reach]
     position = torch.arange(-reach, reach, dtype=torch.float64, device=base.device)
-    even, odd = (  # tones of the sweeps before and after, from the middle of each on
+    # tones of the sweeps before and after the boundary, relative to the middle of each
+    even, odd = (
         (value[..., None] * unit_phasor(cycles[..., None] * at, torch.complex128)).sum(-2)
         for cycles, value, at in (
             (*(x[..., 0::2, :] for x in tones), position + (n + 1) / 2),
@@ -313,13 +321,13 @@ def _fringe(
     most, at = mean.max(-1)
     short = symmetry.gather(-1, at[..., None, None].expand(*symmetry.shape[:-1], 1)) - found
     clear = _sigmas(short)
-    # checked on scenes of 1 to 40 scatterers; certainties are in standard deviations
+    # limits checked on scenes of 1 to 40 scatterers; certainties are in standard deviations
     excluded = (found.mean(-2) < 0.9 * most[..., None]) & (clear > 5)
     best = torch.where(excluded, -torch.inf, gain.mean(-2)).argmax(-1)
     sigmas = _sigmas(take(gain.movedim(-1, -2), best, -2)[..., None] - gain)
     others = torch.arange(len(order), device=base.device) != best[..., None]
     certainty = torch.where(others, torch.where(excluded, clear, sigmas), torch.inf).amin(-1)
-    # at an end of the search, further fringes may be better
+    # at an end of the search, fringes beyond it may be better
     beyond = (best == 0) | (best == len(order) - 1) | excluded.all(-1)
     certainty = torch.where(beyond, 0, certainty)
     chosen = torch.where(certainty > 3, take(offsets, best), expected)
@@ -332,14 +340,14 @@ def _sigmas(x: Tensor) -> Tensor:
 
 
 def _symmetry(windows: _Windows, base: Tensor, shift_cycles: Tensor, is_complex: bool) -> Tensor:
-    """Symmetry of the samples about instants near the turning points, (..., k, m), k of the pairs.
+    """Symmetry of the samples about instants near the turning points, (..., k, m), for k of the
+    pairs.
 
-    The optical frequency is symmetric about a turning point, and so are the samples of any scene,
-    once the Doppler shift is removed: the sum of products of samples that lie symmetrically about
-    an instant is greatest there. The instants run from -margin to margin about base in steps of
-    1 / (2 _FINE) sample. An analytic signal is conjugate-symmetric instead.
-
-    shift_cycles: Doppler shift in cycles per sample, (..., k).
+    The optical frequency is symmetric about a turning point. So are the samples of any scene, once
+    the Doppler shift is removed: the sum of products of samples that lie symmetrically about an
+    instant is greatest there. The instants run from -margin to margin about base in steps of 1 / (2
+    _FINE) sample. An analytic signal is conjugate-symmetric instead. shift_cycles: Doppler shift in
+    cycles per sample, (..., k).
     """
     n, reach = windows.radar.sweep_samples, windows.margin
     half = n // 2 - reach
@@ -354,12 +362,12 @@ def _symmetry(windows: _Windows, base: Tensor, shift_cycles: Tensor, is_complex:
     other = torch.fft.fft(x.conj(), 4 * half) if is_complex else spectrum
     product = torch.fft.fftshift(spectrum * other, dim=-1)
     fine = torch.fft.ifft(torch.fft.ifftshift(torch.nn.functional.pad(product, [2 * half * (_FINE - 1)] * 2), dim=-1))
-    middle = (2 * half - 1) * _FINE  # the instant before sample `half` by half a sample
+    middle = (2 * half - 1) * _FINE  # instant half a sample before sample `half`
     return fine.real[..., middle - 2 * reach * _FINE : middle + 2 * reach * _FINE + 1] * _FINE
 
 
 def _scene_share(windows: _Windows, base: Tensor, is_complex: bool) -> Tensor:
-    """Share of the scene in the power (...,), if it fills less than half of the spectrum."""
+    """Share (...,) of the scene in the power, if the scene fills less than half of the spectrum."""
     spectra = torch.fft.fft(windows.cut(base[..., None]).squeeze(-4))
     power = (spectra if is_complex else spectra[..., : spectra.shape[-1] // 2]).abs().square()
     mean = power.mean((-3, -2, -1), dtype=torch.float64)
@@ -368,7 +376,7 @@ def _scene_share(windows: _Windows, base: Tensor, is_complex: bool) -> Tensor:
 
 
 def _interpolated(x: Tensor, position: Tensor) -> Tensor:
-    """Linear interpolation of x (..., k, n) at fractional indices (..., m), (..., k, m)."""
+    """Interpolate x (..., k, n) linearly at fractional indices (..., m), (..., k, m)."""
     first = position.long().clamp(0, x.shape[-1] - 2)
     shape = (*x.shape[:-1], position.shape[-1])
     low, high = (x.gather(-1, (first + i)[..., None, :].expand(shape)) for i in (0, 1))
@@ -376,8 +384,11 @@ def _interpolated(x: Tensor, position: Tensor) -> Tensor:
 
 
 def _order_by_beat(gap: Tensor, nearer: bool, radar: TriangularLadar) -> tuple[Tensor, Tensor]:
-    """Whether even sweeps are up, from the higher beat of up sweeps, and how certain; gap (...,
-    line, pair) of the beats of even and odd sweeps in cycles per sample.
+    """True where even sweeps are up, because up sweeps have the higher beat frequency, and the
+    certainty of this.
+
+    gap: differences (..., line, pair) of the beat frequencies of even and odd sweeps in cycles per
+    sample.
     """
     gap = gap.flatten(-2)
     middle = gap.median(-1).values
@@ -387,11 +398,11 @@ def _order_by_beat(gap: Tensor, nearer: bool, radar: TriangularLadar) -> tuple[T
 
 
 def _order_by_envelope(gap: Tensor, doppler: Tensor, radar: TriangularLadar) -> tuple[Tensor, Tensor]:
-    """Whether even sweeps of a real record are up, and how certain.
+    """True where even sweeps of a real record are up, and the certainty of this.
 
-    Even sweeps are up if the range of the beats rises with the velocity that this assumption gives.
-    Range changes by plus or minus the integrated velocity. The certainty is the correlation of both
-    relative to that due to the scatter of the range from period to period.
+    Even sweeps are up if the range from the beat frequencies rises with the velocity that this
+    assumption gives. Range changes by plus or minus the integrated velocity. The certainty is the
+    correlation of both relative to that due to the scatter of the range from period to period.
     """
     plus, shift = (_without_outliers(x.flatten(-2) if x.shape[-2] == 1 else x[..., 0]) for x in (gap / 2, doppler))
     range_m = plus * (radar.sample_rate_hz * radar.wave_speed_m_s / (2 * radar.chirp_rate_hz_s))
@@ -406,7 +417,7 @@ def _order_by_envelope(gap: Tensor, doppler: Tensor, radar: TriangularLadar) -> 
 
 
 def _without_outliers(x: Tensor, sigmas: float = 6.0) -> Tensor:
-    """Values (..., k) with outliers replaced by a running median."""
+    """Replace outliers of values (..., k) by a running median."""
     width = min(9, x.shape[-1] // 2 * 2 - 1)
     near = torch.arange(x.shape[-1], device=x.device)[:, None] + torch.arange(width, device=x.device) - width // 2
     middle = x[..., near.clamp(0, x.shape[-1] - 1)].median(-1).values
