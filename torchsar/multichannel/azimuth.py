@@ -58,7 +58,7 @@ def azimuth_filter(
     real = sine.detach().abs() < 1
     square = torch.where(real, sine, 0.0).square()
     closest = motion.closest_m[..., None]
-    # Rmin sqrt(1 - s^2) - R_ref as a sum of differences, which keeps precision
+    # written as a sum of differences, Rmin sqrt(1 - s^2) - R_ref keeps its precision
     path = (closest - radar.reference_range_m) - closest * square / (1 + torch.sqrt(1 - square))
     return unit_phasor(path / radar.wavelength_m, dtype) * real.to(real_dtype(dtype))
 

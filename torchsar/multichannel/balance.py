@@ -213,7 +213,7 @@ def estimate_balance(
         turn = torch.zeros(*data.shape[:-3], radar.channels, dtype=torch.float64, device=data.device)
         if position is not None and middle is not None:
             products = _products(lines, blocks, no_power)
-            coarse_db = 20.0  # by trial: from 20 dB on, delays hardly depend on it
+            coarse_db = 20.0  # by trial; from 20 dB on, delays hardly depend on it
             by_block = model.weights(products.movedim(-3, 0), coarse_db)[0].movedim(0, -2)
             turn = _slope(by_block, middle, reference)
             products = _products(_turned(lines, turn, position), blocks, no_power)
@@ -281,14 +281,16 @@ def _products(lines: Tensor, blocks: int, no_power: Tensor) -> Tensor:
 
 
 def _turned(lines: Tensor, turn: Tensor, position: Tensor) -> Tensor:
-    """Turn lines (..., channel, bin, frequency) by `turn` (..., channel) at the end of the band."""
+    """Turn the phases of lines (..., channel, bin, frequency) by `turn` (..., channel) at the end
+    of the band.
+    """
     return lines * unit_phasor(turn[..., None, None] * (position / (2 * math.pi)), lines.dtype)
 
 
 def _slope(weights: Tensor, position: Tensor, reference: int) -> Tensor:
-    """Return turns, (..., channel), from the phases of weights (..., block, channel).
+    """Return the phase slopes, (..., channel), of weights (..., block, channel) over the position.
 
-    Turns are phases per unit of the position. Blocks whose phase is far off do not count.
+    Blocks whose phase is far from the line have no weight.
     """
     turn = weights * weights[..., reference, None].conj()
     step = position[1] - position[0]

@@ -1,13 +1,11 @@
 """Assessment of channel weights that are fitted to stationary clutter: deviations and outcome.
 
-The model of the clutter errs: its power over Doppler and over range is not the expected one, or a
-few points make it up. The deviations therefore follow from the data. The gradient of the likelihood
-is a sum over range cells, whose clutter and noise are independent of each other: its scatter over
-blocks of cells gives its covariance, and with the Hessian that of the unknowns. What leaks
-coherently into all channels leaves the gradient of each cell at zero and does not count as noise.
-
-Reference:
-    White 1982 (covariance of a maximum-likelihood estimate whose model errs).
+The model of the clutter has errors: its power over Doppler and over range is not the expected one,
+or a few points dominate. The deviations therefore follow from the data. The gradient of the
+likelihood is a sum over range cells, whose clutter and noise are independent of each other. Its
+scatter over blocks of cells gives its covariance, and with the Hessian that of the unknowns. What
+leaks coherently into all channels leaves the gradient of each cell at zero and does not count as
+noise. Reference: White 1982 (covariance of a maximum-likelihood estimate whose model has errors).
 """
 
 from __future__ import annotations
@@ -58,7 +56,7 @@ def assessed_balance(
     hessian, determined = _inverse(fit.hessian, reference, channels)
 
     def std(covariance: Tensor, rows: Tensor, unknown: float = 1e3) -> Tensor:
-        """Deviations in rad or neper, 1e3 of what is not determined."""
+        """Standard deviations in rad or neper; 1e3 for what is not determined."""
         variance = ((rows @ covariance) * rows).sum(-1).clamp_min(0)
         return torch.where(determined[..., None], variance.sqrt(), unknown).clamp_max(unknown)
 
@@ -73,17 +71,18 @@ def assessed_balance(
     noise = weight * 10 ** (-snr_db[..., None] / 10)
     share = _blocks((cells.abs().square().mean((-3, -2)) - noise).clamp_min(0))
     share = share / share.sum(-1, keepdim=True).clamp_min(tiny)
-    # Balanced channels have equal power, but with a wrong prior other gains are more likely. It is
-    # taken to be wrong where the powers differ by four times as much as by chance, by choice. Hann
-    # weights leave 18 / 35 independent looks per pulse: (mean square)^2 / mean fourth power.
+    # Balanced channels have equal power, but with a wrong prior other gains are more likely. By
+    # choice, the prior counts as wrong where the powers differ by four times as much as by chance.
+    # Hann weights leave 18 / 35 independent looks per pulse: (mean square)^2 / mean fourth power.
     looks = (weight > 0).sum(-1, keepdim=True) * (lines.shape[-2] * 18 / 35)
     level = lines.abs().square().mean((-2, -1))
     uneven = torch.log((level / level[..., reference, None].clamp_min(1e-300)).clamp_min(1e-3)).abs() / 2
     chance = model.chance(snr_db, reference, looks) / 2
     log_std = torch.where(uneven > 4.0 * chance, torch.hypot(log_std, uneven), log_std)
-    # A linear phase error of 0.1 rad, three times the first limit, already makes false targets of
-    # about -20 dB when three bands are reconstructed at a PRF of 180 Hz; so do amplitudes. Phases
-    # that delays turn over the range band, here their rms, weigh less, since their mean is zero.
+    # A linear phase error of 0.1 rad, three times the first limit, already causes false targets of
+    # about -20 dB when three bands are reconstructed at a PRF of 180 Hz. So do errors of amplitude.
+    # Phases due to delays, here their rms over the range band, weigh less, because their mean is
+    # zero.
     largest, across = torch.maximum(phase_std, log_std).amax(-1), turn_std.amax(-1) / math.sqrt(3)
     relative = torch.maximum(largest / 0.033, across / 0.1)
     # Limits by choice.
@@ -121,7 +120,8 @@ def _score(lines: Tensor, inner: Tensor, dim: int, weight: Tensor | float = 1.0)
 def _blocks(values: Tensor, blocks: int = 32) -> Tensor:
     """Add neighbouring values along the last dimension to at most this number of blocks.
 
-    By choice, 32 of range cells or frequencies, which give a standard deviation to 13 %.
+    By choice there are 32 blocks of range cells or frequencies, which give a standard deviation to
+    13 %.
     """
     count, blocks = values.shape[-1], min(blocks, values.shape[-1])
     at = torch.arange(count, device=values.device) * blocks // count

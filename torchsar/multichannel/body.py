@@ -115,10 +115,11 @@ def find_body(
     Raises:
         TypeError: If the samples are not complex64 or complex128.
         ValueError: If there are no samples, the channels are not those of the radar, or a sample is
-            not finite, or if the data have no range cell of the body, or fewer than 12 beside it.
+            not finite. Also if the data have no range cell of the body, or fewer than 12 beside it.
     """
     data = checked_channels(data, frame.radar, "find_body", "channel, pulse, range")
-    if data.shape[-2] < 4:  # convention: two overlapping segments of two pulses
+    # least number of pulses, by convention: two overlapping segments of two pulses
+    if data.shape[-2] < 4:
         raise ValueError(f"find_body needs at least 4 pulses, got {data.shape[-2]}; give a longer record")
     half = frame.radar.ambiguous_velocity_m_s / 2 if u_r_half_m_s is None else u_r_half_m_s
 
@@ -127,11 +128,13 @@ def find_body(
 
     chip = chip_about(data, frame, shown(0.0, 0.0), extraction)
     for number in range(rounds):
-        # later rounds search near the velocities found, since the motion then changes by little
+        # later rounds search only near the velocities found, because the motion then changes by
+        # little
         wide = number < 2
         u_r, std = _closing_speed(chip, image_s, image_m, half if wide else 2.0)
         motion, reach = shown(u_r, chip.motion.u_a_m_s), extraction.range_m / 2
-        # the lines must contain the body about its middle, the record a pulse that illuminates it
+        # the lines must contain the body around its middle, and the record must contain a pulse
+        # that illuminates it
         inside = bool(frame.range_m[0] + reach <= motion.range_m <= frame.range_m[-1] - reach)
         moved = chip_about(data, frame, motion, extraction) if inside else chip
         if not inside or not bool(moved.lit.any()):
@@ -143,7 +146,8 @@ def find_body(
             image_s, image_m = float(motion.image_s), float(motion.closest_m)
         chip = chip_about(data, frame, motion, extraction)
     u_r, std = _closing_speed(chip, image_s, image_m, 1.0)
-    for _ in range(2):  # a third step changes u_r by a hundredth of its standard deviation at most
+    # a third step would change u_r by at most a hundredth of its standard deviation
+    for _ in range(2):
         chip = chip_about(data, frame, shown(u_r, chip.motion.u_a_m_s), extraction)
         step, std, _ = chip.fit(chip.picture(), image_s, image_m)
         u_r = u_r + step.clamp(-1.0, 1.0)
@@ -154,14 +158,14 @@ def _body_of(chip: Chip, std: Tensor, half_m_s: float, lost: bool = False) -> Bo
     """Form the body of a chip and judge it.
 
     The limits were found by trial. Of 200 pairs of ships in one place, 35 had a predicted standard
-    deviation below 0.3 m/s, 1.1 deviations off in the rms, one by more than 5; ships on a sea stay
-    below 0.13 m/s. u_r displaces a body by about 20 m per m/s. Sea alone has a mean of the bright
-    pixels below 18 in 15 trials; a ship that is weak but visible (4 dB in the frames of the tests)
-    reaches 7000.
+    deviation below 0.3 m/s. Their rms error was 1.1 standard deviations, and one exceeded 5. Ships
+    on a sea stay below 0.13 m/s; u_r displaces a body by about 20 m per m/s. In sea without a ship,
+    the mean of the bright pixels was below 18 in 15 trials. For a ship that is weak but visible (4
+    dB in the frames of the tests) it reaches 7000.
     """
     picture = chip.picture()
     level = (picture.level * picture.bright).sum() / picture.bright.sum().clamp_min(1)
-    # a velocity in the last part of the search counts as at its end
+    # a velocity in the last 2 % of the search counts as one at its end
     inside = (chip.motion.u_r_m_s.abs() < 0.98 * half_m_s) & (not lost)
     outcome = worst(
         (Outcome.NOISE, ~(level > 40.0)), (Outcome.OUTSIDE_SEARCH, ~inside), (Outcome.INEXACT, ~(std < 0.3))
@@ -170,11 +174,13 @@ def _body_of(chip: Chip, std: Tensor, half_m_s: float, lost: bool = False) -> Bo
 
 
 def _closing_speed(chip: Chip, image_s: float, image_m: float, half_m_s: float) -> tuple[Tensor, Tensor]:
-    """Return the most likely u_r near that of the chip, and its standard deviation."""
+    """Return the most likely slant-range speed u_r near that of the chip, and its standard
+    deviation.
+    """
 
     def energy(u_r: Tensor) -> Tensor:
         u_a, where = chip.motion.u_a_m_s, (image_s, image_m)
-        # all at once take two thirds of the time and nine times the memory
+        # all speeds at once take two thirds of the time, but nine times the memory
         parts = (PointMotion.imaged_at(chip.radar, chip.cells, x, u_a.expand(x.shape), *where) for x in u_r.split(9))
         return torch.cat([chip.energy(part) for part in parts])
 
@@ -187,8 +193,8 @@ def _highest(
     """Return the speed of the highest value, by grids about the middle, and its standard deviation.
 
     A grid takes 40 steps to either side of its middle (0.5 m/s in a search of +-20 m/s, as in
-    `Search`). The next one has a tenth of the step, about the maximum, which a parabola refines.
-    The deviation is that of a log-likelihood.
+    `Search`). The next one is centred on the maximum and has a tenth of the step. A parabola
+    refines the maximum. The value is a log-likelihood, from which the standard deviation follows.
     """
     std = step = torch.as_tensor(half_m_s / half, dtype=torch.float64)
     grid = torch.arange(-half, half + 1, dtype=torch.float64, device=middle.device)
@@ -203,18 +209,20 @@ def _highest(
 
 
 def _along_speed(chip: Chip, half_m_s: float) -> Tensor:
-    """Return the u_a within half_m_s of that of the chip with the sharpest image.
+    """Return the along-track speed u_a with the sharpest image, within half_m_s of that of the
+    chip.
 
     Sharpness is the mean square of the intensities over their squared mean.
     """
     radar, motion = replace(chip.radar, channel_m=(0.0,)), chip.motion
     time_s = chip.time_s[chip.lit]
-    # Hann weighted, since side lobes of neighbouring scatterers would interfere
+    # Hann weights prevent interference by side lobes of neighbouring scatterers
     echo = chip.echo(chip.cells)[:, chip.lit] * torch.hann_window(
         len(time_s), dtype=torch.float64, device=time_s.device
     )
-    # the brightest lines: by trial, 4 to 16 give the same velocities, 16 take a quarter more time;
-    # squares of squares must fit into single precision
+    # The brightest eight lines are used. By trial, 4 to 16 give the same velocities, and 16 take a
+    # quarter more time. Lines are scaled to unit level, because squares of squares must fit into
+    # single precision.
     echo = unit_level(echo[echo.abs().square().sum(-1).topk(min(8, len(echo))).indices])
     back = point_phasor(radar, motion, time_s, torch.complex128)[0]
 

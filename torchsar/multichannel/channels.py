@@ -1,4 +1,6 @@
-"""What all stages on channels share: their axes, and the checks of channels and of slow time."""
+"""Common parts of all stages on channels: their axes, and the checks of channels and of
+slow time.
+"""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.model import point_phasor
 from torchsar.radar import BistaticRadar
 
-TINY = 1e-100  # floor of divisors, far from the overflow of reciprocals
+TINY = 1e-100  # lowest divisor; its reciprocal is far from overflow
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Segments:
 
     @property
     def _windows(self) -> dict[str, Any]:
-        """Arguments of the transforms in both directions."""
+        """Arguments of the transforms to short-time spectra and back."""
         window = torch.hann_window(self.length, dtype=torch.float64, device=self.bins.device)
         return {"n_fft": self.length, "hop_length": self.length // 2, "window": window, "onesided": False}
 
@@ -219,7 +219,7 @@ class Chip:
             Echo, complex128 (line, channel, pulse), zero in pulses in which no part of the body is
             illuminated.
         """
-        # by trial: a lower level removes sea as well, a higher one leaves some of the body
+        # By trial. A lower level removes sea as well, a higher one leaves a part of the body.
         clear = picture.amplitude * (picture.level > 2.0)
         spectrum = torch.zeros(len(clear), self.radar.channels, self.segments.n, dtype=clear.dtype, device=clear.device)
         spectrum[..., picture.index] = clear[:, None] * self.steering(self.motion, picture.tone_hz).mT
@@ -242,11 +242,11 @@ class Chip:
             The change of u_r that explains more of the data, in m/s.
 
             The predicted standard deviation of u_r in m/s: that of sea and noise times the misfit,
-            since an error of the model is the same in all cells of a scatterer and does not
-            average; or the scatter of the steps that single range lines and segments ask for, if
-            that is more; or the standard deviation between the speeds of range lines, beyond that
-            of sea and noise, if that is still more: lines of one body have one speed, and where
-            they have not, two bodies overlap, and u_r lies between their speeds.
+            because an error of the model is the same in all cells of a scatterer and is not
+            averaged. If the scatter of the steps from single range lines and segments is larger, it
+            is that scatter. If the standard deviation between the speeds of range lines, beyond
+            that of sea and noise, is still larger, it is that one. Lines of one body have one
+            speed; where they have not, two bodies overlap, and u_r lies between their speeds.
 
             The misfit, the energy that is left of the bright cells for each free dimension,
             relative to the covariance of sea and noise: 1 if scatterers of one velocity explain
@@ -260,7 +260,7 @@ class Chip:
             """Return the part of cells that no amplitude of the model explains."""
             return cells - ((backed.conj() * cells).sum(1) / level.clamp_min(TINY))[:, None] * made
 
-        step_m_s = 1e-3  # for the derivative, far below any standard deviation
+        step_m_s = 1e-3  # step for the derivative, far below any standard deviation
         speed = self.motion.u_r_m_s + step_m_s
         there = PointMotion.imaged_at(self.radar, self.cells, speed, self.motion.u_a_m_s, image_s, image_m)
         turns = (self.motion.y0_m - there.y0_m) / (step_m_s * self.radar.wavelength_m * there.range_m)
@@ -268,10 +268,11 @@ class Chip:
         pull = torch.einsum("lmsf,sfmn->lnsf", slope.conj(), self.inverse)
         curvature = (pull * slope).sum().real.clamp_min(TINY)
         left = across(self.cells - made)
-        bright = level > 12.0  # as in `Picture.bright`
+        bright = level > 12.0  # the same limit as in `Picture.bright`
         count = (bright.sum() * (self.radar.channels - 1)).clamp_min(1)
         misfit = (self.whitened(left) * bright).sum() / count
-        # every pulse lies in two segments, so that the curvature, and the segments, count it twice
+        # every pulse lies in two segments, so that the curvature and the scatter of the segments
+        # contain it twice
         step = (pull * left).sum(1).real / curvature
         by_line, share = step.sum((-2, -1)), (pull * slope).sum((1, 2, 3)).real / curvature
         scatter = by_line.square().sum() + 2 * step.sum((0, -1)).square().sum()
@@ -356,7 +357,8 @@ def chip_about(data: Tensor, frame: Frame, motion: PointMotion, extraction: Extr
         ValueError: If the data have no range cell of the body, or fewer than 12 beside it.
     """
     off, least = (frame.range_m - motion.range_m).abs(), 12
-    # side lobes of the body reach the cells left out; by trial, 2 to 12 give the same velocities
+    # Side lobes of the body reach the guard cells that are left out. By trial, 2 to 12 cells give
+    # the same velocities.
     guarded_m = extraction.range_m + 6 * frame.radar.range_step_m
     body, beside = (near.nonzero()[:, 0] for near in (off <= extraction.range_m, off > guarded_m))
     if not len(body) or len(beside) < least:
@@ -384,10 +386,10 @@ def chip_about(data: Tensor, frame: Frame, motion: PointMotion, extraction: Extr
         frame.time_s,
     )
     chip = replace(chip, inverse=_inverse_covariance(chip))
-    # Lines beside the body that hold more than sea and noise, such as another target, are left
-    # out. Their energy is whitened, so that a target counts that the sea hides. They exceed the
-    # median by six standard deviations, which are 1.48 times the median deviation of a normal
-    # distribution. By trial, 4 to 8 leave out lines that hold other ships, and no sea.
+    # Lines beside the body that contain more than sea and noise, such as another target, are left
+    # out. Their energy is whitened, so that a target below the sea counts as well. They exceed the
+    # median by six standard deviations; one is 1.48 times the median deviation of a normal
+    # distribution. By trial, limits of 4 to 8 leave out lines with other ships, and no sea.
     for _ in range(3):
         energy = chip.whitened(chip.beside).sum((-2, -1))
         off = energy - energy.median()
@@ -415,14 +417,14 @@ def _segments(frame: Frame, motion: PointMotion, extraction: Extraction, lit: Te
 def _inverse_covariance(chip: Chip) -> Tensor:
     """Return the inverse covariance of the lines beside the body.
 
-    Its phases depend on the tone as those of positions do; otherwise it is the same for all tones
+    Its phases depend on the tone as those of positions do. Otherwise it is the same for all tones
     of a segment.
     """
     turn = chip.steering(chip.motion, chip.tone_hz)
     aligned = chip.beside.movedim(1, -1) * turn.conj()
     covariance = torch.einsum("lsfm,lsfn->smn", aligned, aligned.conj()) / (aligned.shape[0] * aligned.shape[2])
     level = covariance.diagonal(dim1=-2, dim2=-1).real.mean(-1).clamp_min(TINY)[:, None, None]
-    # the diagonal keeps the covariance of noise-free data invertible
+    # the diagonal term keeps the covariance of noise-free data invertible
     eye = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
     inverse = matrix_inverse(covariance + 1e-5 * level * eye)
     return turn[..., :, None] * inverse[:, None] * turn.conj()[..., None, :]

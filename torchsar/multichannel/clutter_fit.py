@@ -122,8 +122,8 @@ class ClutterModel:
     def _smoothed(self, products: Tensor, near: int = 4) -> Tensor:
         """Average covariances (..., bin, channel, channel) over neighbouring Doppler bins.
 
-        The delays between the channels are removed meanwhile. Nine bins of 80 range cells give the
-        power to 5 %.
+        The delays between the channels are removed meanwhile. Nine bins of 80 range cells determine
+        the power to 5 %.
         """
         bins, first = products.shape[-3], first_bin(products.shape[-3], self.response.shape[-1])
         steering = self.response[..., :1] @ self.response[..., :1].mH
@@ -162,19 +162,19 @@ class ClutterModel:
         power = products.diagonal(dim1=-2, dim2=-1).real.mean(-2)
         level = power.clamp_min(torch.finfo(torch.float64).tiny).rsqrt().to(matrix.dtype)
         least = torch.linalg.eigh(level[..., :, None] * matrix * level[..., None, :])[1][..., 0]
-        # no channel starts without weight, by choice
+        # every channel starts with at least a tenth of the weight, by choice
         found = solve(matrix[..., None, :, :], level * torch.polar(least.abs().clamp_min(0.1), least.angle()))
         return found.weights, 2 * found.cost + torch.linalg.slogdet(model)[1].mean(-1)
 
     def homogeneous(self, cells: Tensor, no_power: Tensor, bins: int = 256, rounds: int = 8) -> Tensor:
-        """Return weights of range cells that leave out those that the model does not describe.
+        """Return weights of range cells, zero for those that the model does not describe.
 
-        In such cells something moves, or another source is heard. The model is fitted to the cells
-        that are kept, and cells are left out whose power outside the clutter, summed over Doppler,
-        exceeds the median by six standard deviations, which are 1.48 times the median deviation of
-        a normal distribution, and is twice the median at least. This repeats until nothing changes.
-        Strong clutter does not count as power outside the clutter, where its bands are fewer than
-        the channels; with as many bands the whole whitened power counts.
+        In such cells something moves, or there is another source. The model is fitted to the cells
+        that are kept, and the power outside the clutter is summed over Doppler. Cells are left out
+        where this power is at least twice the median and exceeds it by six standard deviations; one
+        is 1.48 times the median deviation of a normal distribution. This repeats until nothing
+        changes. If the clutter has fewer bands than there are channels, strong clutter does not
+        count as power outside the clutter. With as many bands, the whole whitened power counts.
 
         Args:
             cells: Doppler spectra of range cells, complex128 (..., channel, bin, cell).
@@ -194,7 +194,8 @@ class ClutterModel:
             products = torch.where(no_power[..., None, None, None], eye, products)
             snr_db = thin.snr_db(products)
             weighted = x * thin.weights(products, snr_db)[0][..., None, :, None]
-            # far above the noise, so that clutter of any strength has little whitened power
+            # an SNR far above the actual one, so that clutter of any strength has little whitened
+            # power
             inner = matrix_inverse(thin.noisy(snr_db + 30.0)) @ weighted
             power = (weighted.conj() * inner).real.sum((-3, -2))
             known = power.masked_fill(kept == 0, torch.nan)
@@ -241,7 +242,7 @@ class ClutterModel:
         moved = weights[..., None, :] * torch.cat([torch.ones_like(others[:1]), others])
         form = (moved.conj() * (moved @ matrix.mT)).sum(-1).real
         lead = form[..., 1:] - form[..., :1]
-        # phases that are nearly equal in all channels displace nothing (.995: by choice)
+        # phases that are nearly equal in all channels displace nothing (limit of 0.995 by choice)
         return torch.where(others.mean(-1).abs() < 0.995, lead, torch.inf).amin(-1)
 
     def snr_db(self, products: Tensor) -> Tensor:

@@ -204,7 +204,8 @@ def singular_speeds_m_s(radar: BistaticRadar, bands: int, u_a_m_s: tuple[float, 
     def different(turns: list[float]) -> int:
         """Count the phases of channels, in cycles, that differ by other than whole cycles."""
         off = [[abs((x - before + 0.5) % 1 - 0.5) for before in turns[:i]] for i, x in enumerate(turns)]
-        return sum(all(cycles > 1e-6 for cycles in row) for row in off)  # more than rounding
+        # differences of less than 1e-6 are rounding
+        return sum(all(cycles > 1e-6 for cycles in row) for row in off)
 
     return sorted(radar.speed_m_s - v for v in speeds if different([x * prf / v for x in positions]) < bands)
 
@@ -225,7 +226,7 @@ def _tone_limits(radar: BistaticRadar, use: MultichannelUse) -> list[Limit]:
         Limit(
             "slant-range speed",
             centre,
-            0.95 * half,  # convention
+            0.95 * half,  # factor by convention
             "m/s",
             "warn",
             "velocities are measured modulo lambda PRF, and appear at the other end of the interval",
@@ -259,7 +260,9 @@ def _estimator_limits(radar: BistaticRadar, use: MultichannelUse) -> list[Limit]
     gathered = Limit(
         "SNR gathered over channels and pulses",
         snr_db + 10 * math.log10(radar.channels * use.integration_s * radar.prf_hz),
-        19.0,  # -15 dB per sample with three channels and 810 pulses; below, the strongest tone is often one of noise
+        # 19 dB is -15 dB per sample with three channels and 810 pulses; below it, the strongest
+        # tone is often one of noise
+        19.0,
         "dB",
         "warn",
         "estimates below the threshold have gross errors",
@@ -269,7 +272,7 @@ def _estimator_limits(radar: BistaticRadar, use: MultichannelUse) -> list[Limit]
     of_sample = Limit(
         "SNR of a sample for the intensity ratio",
         snr_db,
-        7.0,  # the upper end of its threshold, which lies at 0 to 7 dB
+        7.0,  # upper end of the threshold, which lies at 0 to 7 dB
         "dB",
         "warn",
         "the ratio is below its threshold",

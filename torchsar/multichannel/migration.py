@@ -30,8 +30,8 @@ from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.radar import BistaticRadar
 from torchsar.radar.bistatic import receive_range
 
-# Relative error of the non-uniform FFT: -100 dB, well below the -60 dB asked of complex64 images;
-# in complex128 a smaller error would widen the kernel and cost time.
+# Relative error of the non-uniform FFT. It is -100 dB, well below the -60 dB required of complex64
+# images. In complex128, a smaller error would widen the kernel and take time.
 _EPS = {torch.complex64: 1e-5, torch.complex128: 1e-10}
 
 
@@ -96,9 +96,10 @@ class Frame:
         return whole - self._moved_m(reference, reference.range_m[..., None, None, None], walks)
 
     def _moved_m(self, reference: PointMotion, range_m: Tensor, walks: float) -> Tensor:
-        """Return the range history R_m(t) - R0 of the reference motion at given closest ranges.
+        """Return the range history R_m(t) - R0 of the reference motion at given closest ranges,
+        (..., channel, pulse, range).
 
-        Its derivative times slow time and `walks` is subtracted. (..., channel, pulse, range)
+        Its derivative times slow time and `walks` is subtracted.
         """
         time_s, channel_m = self.time_s[:, None], self.radar.channels_at(self.time_s.device)[:, None, None]
         u_r, u_a, y0 = (x[..., None, None, None] for x in (reference.u_r_m_s, reference.u_a_m_s, reference.y0_m))
@@ -232,7 +233,7 @@ def _rescaled(spectrum: Tensor, radar: BistaticRadar, ambiguity: Tensor) -> Tens
     n, frequency = spectrum.shape[-2], radar.range_frequency_hz(spectrum.shape[-1], spectrum.device)
     margin = math.ceil(n * radar.sampling_hz / (4 * radar.carrier_hz - 2 * radar.sampling_hz)) + 1
     padded, ambiguity = pad(spectrum, (0, 0, margin, margin)), ambiguity[..., None]
-    # blocks of a few columns stay in the cache: four times as fast as all columns at once
+    # blocks of a few columns fit into the cache, which is four times as fast as all columns at once
     width = max(16, block_bytes_of(spectrum.device) // (n * spectrum.element_size()))
     parts = [
         keystone(x, f, radar.carrier_hz, ambiguity) for x, f in zip(padded.split(width, -1), frequency.split(width))
@@ -241,7 +242,9 @@ def _rescaled(spectrum: Tensor, radar: BistaticRadar, ambiguity: Tensor) -> Tens
 
 
 def _profiles(spectrum: Tensor, frame: Frame, reference: PointMotion, walks: float) -> Tensor:
-    """Return range profiles, each cell read where `Frame.residual_m` predicts its envelope."""
+    """Return range profiles; each cell is interpolated at the range where `Frame.residual_m`
+    predicts its envelope.
+    """
     n = spectrum.shape[-1]
     cells = (
         torch.arange(n, dtype=torch.float64, device=spectrum.device)

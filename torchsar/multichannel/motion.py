@@ -117,7 +117,7 @@ class PointMotion:
     def each(self, change: Callable[..., Tensor], *others: PointMotion) -> PointMotion:
         """Return the motion with a function applied to u_r_m_s, u_a_m_s, y0_m and range_m.
 
-        The function gets the value of this motion, followed by those of `others`.
+        The arguments of the function are the value of this motion, followed by those of `others`.
         """
         values = [change(*(getattr(motion, name) for motion in (self, *others))) for name in _VALUES]
         return PointMotion(*values, speed_m_s=self.speed_m_s)

@@ -116,7 +116,7 @@ class FocusPlan(Stage):
             return Signal(torch.fft.ifft(bands.flatten(-2)), (axis,))
         rows = data.reshape(-1, *data.shape[-2:])
         image = rows.new_empty(len(rows), axis.n)
-        # blocks of a few trials stay in the cache
+        # blocks of a few trials fit into the cache
         height = max(1, block_bytes_of(data.device) // (matrix[0].numel() * data.element_size()))
         for part, out in zip(rows.split(height), image.split(height)):
             torch.fft.ifft(_combined(matrix, torch.fft.fft(part)).flatten(-2), out=out)
@@ -147,7 +147,7 @@ def _matrix(radar: BistaticRadar, motion: PointMotion, n: int, rebuild: Rebuild,
     if bandwidth_hz is not None:
         found = found * ((middle_hz + offset - centre_hz).abs() <= bandwidth_hz / 2)[:, None]
     bins = torch.remainder(torch.round((middle_hz + offset) / step), total)
-    # slow time zero is the middle of the data and of the image
+    # slow time zero is in the middle of the data and of the image
     turns = torch.remainder(bins, n) * (n // 2) / n - bins * (total // 2) / total
     natural = torch.zeros_like(found)
     natural[bins.long()] = found * unit_phasor(turns, torch.complex128)[:, None]

@@ -98,7 +98,7 @@ class LeastSquares:
         """
         matrix = band_matrix(radar, motion, self.bands)
         normal = matrix.mH @ matrix
-        # it acts on singular values below 1e-6 of the largest
+        # the floor acts on singular values below 1e-6 of the largest one
         floor = 1e-12 * self.bands * radar.channels
         return linear_solve(normal + floor * torch.eye(self.bands, dtype=normal.dtype, device=normal.device), matrix.mH)
 
@@ -152,7 +152,7 @@ class MinimumMeanSquare:
         return linear_solve(weighted @ matrix.mH + noise, weighted).mH
 
 
-# Reconstruction method: the number of Doppler bands and the weights that separate them.
+# reconstruction method: the number of Doppler bands, and the weights that separate them
 Rebuild = LeastSquares | MinimumMeanSquare
 
 
@@ -171,7 +171,8 @@ def noise_and_clutter(radar: BistaticRadar, lit_s: float | None, n_pulse: int, p
         channel, channel).
     """
     band = None if lit_s is None else radar.speed_m_s**2 * lit_s / (radar.wavelength_m * radar.reference_range_m)
-    prior, bands = ElementPattern() if band is None else FlatBand(band), 5  # which the clutter of a pattern fills
+    # an antenna pattern has clutter in five bands
+    prior, bands = ElementPattern() if band is None else FlatBand(band), 5
     motion = PointMotion.of(radar, torch.zeros((), dtype=torch.float64))
     power = prior.power(doppler_offsets(n_pulse, bands, radar.prf_hz).view(bands, n_pulse).T, radar, motion)
     shared = shared_response(radar, motion, n_pulse, bands, torch.complex128).T[..., None]

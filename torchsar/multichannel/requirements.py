@@ -24,8 +24,8 @@ from torchsar.multichannel.response import band_matrix
 from torchsar.radar import BistaticRadar
 from torchsar.radar.bistatic import receive_range
 
-# Phase in rad that does not matter, by convention: well below the pi / 4 at which a quadratic phase
-# broadens the impulse response.
+# Phase in rad that can be neglected, by convention. It is well below the pi / 4 at which a
+# quadratic phase broadens the impulse response.
 FAINT_RAD = 0.3
 
 Estimator = Literal["sir", "ati", "ml", "whitened"]
@@ -161,7 +161,7 @@ def multichannel_requirements(
         *_path_rows(radar, use, tolerance_rad),
         *_migration_rows(radar, use),
         *_rebuild_rows(radar, use),
-        # the slant range of a geosynchronous transmitter, and that of the receiver
+        # rows for the slant ranges of a geosynchronous transmitter and of the receiver
         *(
             _row(
                 f"{name} range in float32",
@@ -178,7 +178,7 @@ def multichannel_requirements(
 def _row(
     effect: str, neglects: str, phase_rad: float, tolerance_rad: float, remedy: str, error_db: float = math.nan
 ) -> Requirement:
-    """Return a row of a simplification that shifts no envelope."""
+    """Return the row of a simplification that displaces no envelope."""
     return Requirement(effect, neglects, phase_rad, math.nan, tolerance_rad, remedy, error_db)
 
 
@@ -188,7 +188,7 @@ def _times(use: MultichannelUse) -> Tensor:
 
 
 def _transmit_rows(radar: BistaticRadar, use: MultichannelUse) -> tuple[Requirement, ...]:
-    """Return the rows of the transmit range."""
+    """Return the rows of simplifications of the transmit range."""
     k, half, wave = [*radar.transmit_range, 0.0, 0.0, 0.0, 0.0], use.integration_s / 2, 2 * math.pi / radar.wavelength_m
     second, beyond = wave * abs(k[1]) * half**2, wave * sum(abs(x) * half**i for i, x in enumerate(k[2:], start=3))
     time = _times(use)
@@ -209,15 +209,15 @@ def _transmit_rows(radar: BistaticRadar, use: MultichannelUse) -> tuple[Requirem
 
 
 def _path_rows(radar: BistaticRadar, use: MultichannelUse, tolerance_rad: float) -> tuple[Requirement, ...]:
-    """Return the rows of the receive range."""
+    """Return the rows of simplifications of the receive range."""
     wave, half, r0 = 2 * math.pi / radar.wavelength_m, use.integration_s / 2, radar.reference_range_m
     time, u_r, v = _times(use), use.fastest_m_s, radar.speed_m_s - use.u_a_m_s[0]
-    # a broadside point at the corners of the velocities searched, including u_r = 0: (corner, time)
+    # a broadside point at the extreme velocities of the search and at u_r = 0, (corner, time)
     speeds = [torch.tensor(u, dtype=torch.float64) for u in ((*use.u_r_m_s, 0.0), use.u_a_m_s)]
     across, along = (u.reshape(-1, 1) for u in torch.meshgrid(*speeds, indexing="ij"))
     exact = receive_range(time, across, along, 0.0, r0, radar.speed_m_s, 0.0)
     parabola = exact + across * time - (radar.speed_m_s - along).square() * time.square() / (2 * r0)
-    # Eqs. (6), (7), (corner, channel, time)
+    # range of each channel by Eqs. (6) and (7), (corner, channel, time)
     across, along, dx = across[:, None], along[:, None], radar.channels_at()[:, None]
     past = radar.speed_m_s - along
     delayed = time - dx * past / (past.square() + across.square())
@@ -266,7 +266,7 @@ def _path_rows(radar: BistaticRadar, use: MultichannelUse, tolerance_rad: float)
 
 
 def _migration_rows(radar: BistaticRadar, use: MultichannelUse) -> tuple[Requirement, ...]:
-    """Return the rows of the range migration."""
+    """Return the rows of simplifications of the range migration."""
     cell, v, r0 = (
         radar.wave_speed_m_s / radar.pulse.bandwidth_hz,
         radar.speed_m_s - use.u_a_m_s[0],

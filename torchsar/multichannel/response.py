@@ -206,5 +206,5 @@ class FlatBand:
         return (offset_hz.abs() <= self.bandwidth_hz / 2).to(torch.float64)
 
 
-# Expected power of the echoes over Doppler.
+# expected power of the echoes over Doppler
 Prior = ElementPattern | FlatBand

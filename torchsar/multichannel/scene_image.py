@@ -219,7 +219,7 @@ class ImageMovers(Stage):
         return SceneImage(conventional, rest, fused, list(bodies) if trials else bodies[0], estimate, data)
 
     def _extracted(self, remaining: Signal, known: Sequence[PointMotion] | None) -> tuple[Signal, list[Body]]:
-        """Return the data of one trial without its moving bodies, and all bodies."""
+        """Return the data of one trial without its moving bodies, and a list of all bodies."""
         if known is not None:
             return self._extract_known(remaining, known)
         remaining, bodies = self._extract_detected(remaining, self.image, [])
@@ -230,7 +230,7 @@ class ImageMovers(Stage):
         return remaining, bodies
 
     def _extract_detected(self, remaining: Signal, image_of, bodies: list[Body]) -> tuple[Signal, list[Body]]:
-        """Detect targets and remove those that move, strongest first, until none is new."""
+        """Detect targets and remove those that move, strongest first, until no new one is found."""
         bodies, visited = list(bodies), [self._apparent_position(body) for body in bodies]
         candidates, apart_m = self.detector.found(image_of(remaining)), self.detector.apart_m
         while candidates and len(bodies) < self.detector.most:
@@ -289,9 +289,9 @@ class ImageMovers(Stage):
         the Doppler rate of their target, (v - u_a)^2 / R at the speed v, but at a range R of their
         own, which changes the along-track speed that is found.
         """
-        # A larger difference than 5 m/s rejects targets beside a ship, a smaller one accepts its
-        # side lobes as targets. A body has many points, whose brightest ones exceed the mean level:
-        # hence the factor of 20. Both were found by trial.
+        # Both limits were found by trial. A larger difference than 5 m/s rejects targets beside a
+        # ship, a smaller one accepts its side lobes as targets. The factor of 20 allows for the
+        # many points of a body, whose brightest ones exceed the mean level.
         away_m, cell_m = (
             float((body.motion.range_m - other.motion.range_m).abs()),
             self.radar.wave_speed_m_s / self.radar.pulse.bandwidth_hz,
@@ -304,7 +304,7 @@ class ImageMovers(Stage):
         return near and float(body.level) < most
 
     def _apparent_position(self, body: Body) -> Detection:
-        """Return where an image of the stationary scene shows a body."""
+        """Return the position at which an image of the stationary scene shows a body."""
         return Detection(
             self.radar.speed_m_s * float(body.motion.image_s),
             float(body.motion.closest_m),
@@ -320,8 +320,9 @@ class ImageMovers(Stage):
     def _lines(self, signal: Signal, near_m: float) -> tuple[slice, Frame]:
         """Return the lines around a range, with lines beside it for the covariance of the sea."""
         axis = signal.axis("range")
-        # 6 guard cells, and 28 lines for the covariance of the sea: by trial, 20 to 80 give the
-        # same velocities, 80 take 1.4 times the time; they also hold the migration of the body
+        # 6 guard cells, and 28 lines for the covariance of the sea. By trial, 20 to 80 lines give
+        # the same velocities, and 80 take 1.4 times the time. They also cover the migration of the
+        # body.
         half = math.ceil(self.extraction.range_m / axis.step) + 34
         at = round((near_m - axis.start) / axis.step)
         lines = slice(max(0, at - half), min(axis.n, at + half))
@@ -354,14 +355,14 @@ class ImageMovers(Stage):
         return Estimate(
             value,
             {"u_r_m_s": row([body.u_r_std_m_s for body in bodies])},
-            level / (100.0 + level),  # convention: one half at 20 dB
+            level / (100.0 + level),  # the quality is one half at 20 dB, by convention
             outcome.masked_fill(missing, Outcome.NOISE),
             info={"level": level},
         )
 
 
 def _of_trial(trials: torch.Size, i: int, x: Tensor) -> Tensor:
-    """Value () of one trial of a value that broadcasts to the trials."""
+    """Value () for one trial of a tensor that broadcasts to the trials."""
     return x.expand(trials).reshape(-1)[i]
 
 
@@ -369,9 +370,9 @@ def unbalanced(data: Tensor, radar: BistaticRadar, rebuild: Rebuild, most_m_s: f
     """Test whether stationary clutter shows that the channels are not balanced.
 
     The channels are balanced once more. They count as unbalanced if the clutter determines their
-    differences, and one of them, in radians or nepers, is as large as the phase that a slant-range
-    speed causes over the array, and exceeds four standard deviations. Clutter that does not
-    determine the differences shows nothing.
+    differences, and one of these is large. It is at least the phase, in radians or nepers, that a
+    slant-range speed of `most_m_s` causes over the array, and exceeds four standard deviations.
+    Clutter that does not determine the differences is no evidence.
 
     Args:
         data: Range-compressed channels with the transmit range removed, shape (..., channel, pulse,
@@ -390,7 +391,7 @@ def unbalanced(data: Tensor, radar: BistaticRadar, rebuild: Rebuild, most_m_s: f
     found = estimate_balance(data, radar, prior, bands, blocks=min(16, inside))
     reach_m = max(radar.channel_m) - min(radar.channel_m)
     least = math.pi * reach_m * most_m_s / (radar.wavelength_m * radar.speed_m_s)
-    # phases that a delay turns over the band, in the rms
+    # rms over the band of the phase of a delay
     scales = {
         "phase_rad": 1.0,
         "gain_db": math.log(10) / 20,
@@ -510,7 +511,7 @@ def suppressed_image(
         Remote Sens. 2020, 12, 1703, section 4.3 (clutter suppression via Doppler filtering).
     """
     data = signal.data.movedim(-1, -3)
-    # averaged over all lines and four neighbouring Doppler bins
+    # the covariance is averaged over all lines and four neighbouring Doppler bins
     whitening = line_whitening(data, radar, samples=4 * data.shape[-3])
     backed = whitening.backed(data.to(torch.complex128)).movedim(-3, -1).to(signal.data.dtype)
     best = signal.data.real.new_zeros(())
@@ -530,8 +531,8 @@ def _matched(data: Tensor, radar: BistaticRadar, motion: PointMotion, bands: int
     """
     n = data.shape[-2]
     spectrum = torch.roll(fft_lines(torch.fft.ifftshift(data, dim=-2)), -first_bin(n, bands), -2)
-    # bins lie about zero, not about the Doppler centre of the point: its response at Doppler f is
-    # that at offset f - f_dc
+    # Bins lie about zero Doppler, not about the Doppler centre f_dc of the point. Its response at
+    # Doppler f is that at offset f - f_dc.
     turns = motion.u_r_m_s / radar.wavelength_m * radar.channels_at(data.device) / motion.effective_m_s
     shift = linear_phasor(-turns, 1, 1, data.dtype)
     response = (

@@ -1,18 +1,17 @@
 """Phase and time synchronisation of transmitter and receiver.
 
 The signal of the satellite also reaches the receiver directly. Its range is known from the
-ephemeris, so that the residual phase and delay after compression are the errors of the clocks, one
-of each per pulse, common to all channels. The estimator is that of maximum likelihood for one echo
-of a known band.
+ephemeris, so that the residual phase and delay after compression are the errors of the clocks.
+There is one phase and one delay per pulse, common to all channels. The estimator is that of maximum
+likelihood for one echo of a known band.
 
-Without a direct path, what is at rest shows the phases. A channel passes nearly the places at which
-another one was a pulse before, so that the channels predict the echo of what is at rest from pulse
-to pulse, whatever the scene is; the phase that is left is the drift of the clocks.
+Without a direct path, scatterers at rest determine the phases. A channel passes nearly the places
+at which another one was a pulse before. The channels therefore predict the echo of everything at
+rest from pulse to pulse, whatever the scene is. The remaining phase is the drift of the clocks.
 
-Reference:
-    Remote Sens. 2020, 12, 1703, sections 1 and 2.1, which describe the direct-path reference
-    channel, and strong islands and ships at rest as its substitute, without an estimator;
-    Bellettini and Pinto 2002 (displaced phase centres, for the path of a synthetic aperture sonar).
+Reference: Remote Sens. 2020, 12, 1703, sections 1 and 2.1, which describe the direct-path reference
+channel, and strong islands and ships at rest as its substitute, without an estimator; Bellettini
+and Pinto 2002 (displaced phase centres, for the path of a synthetic aperture sonar).
 """
 
 from __future__ import annotations
@@ -62,11 +61,11 @@ def estimate_synchronisation(direct: Tensor, radar: BistaticRadar, *, assess: bo
     band, frequency = spectrum[..., inside], frequency[inside]
     delay = _refined_delay(band, frequency, _coarse_delay(direct, radar))
     peak = (band * unit_phasor(delay[..., None] * frequency, band.dtype)).sum(-1)
-    # energy of the fitted echo over the noise of one frequency
+    # ratio of the energy of the fitted echo to the noise of one frequency
     fitted = peak.abs().square() / len(frequency)
     noise = (band.abs().square().sum(-1) - fitted) / max(len(frequency) - 2, 1)
     snr = fitted / torch.maximum(noise, 1e-14 * fitted).clamp_min(torch.finfo(torch.float64).tiny)
-    detected = snr >= 10.0  # 10 dB: below, the strongest sample is often one of noise
+    detected = snr >= 10.0  # below 10 dB, the strongest sample is often one of noise
     phase_std = (2 * snr).clamp_min(0.05).rsqrt()
     std = {"phase_rad": phase_std, "delay_s": phase_std / (2 * math.pi * frequency.square().mean().sqrt())}
     value = {"phase_rad": torch.where(detected, torch.angle(peak), 0.0), "delay_s": torch.where(detected, delay, 0.0)}
@@ -92,7 +91,7 @@ def _coarse_delay(direct: Tensor, radar: BistaticRadar, finer: int = 4) -> Tenso
 def _refined_delay(band: Tensor, frequency: Tensor, start: Tensor, steps: int = 4) -> Tensor:
     """Maximise |sum_f X(f) exp(j 2 pi f delay)|^2 by Newton steps near the coarse delay.
 
-    Four steps err by 1e-5 of a sample at 12 dB, by less at a higher SNR.
+    After four steps the error is 1e-5 of a sample at 12 dB, and less at a higher SNR.
     """
     rate, reach, delay = 2j * math.pi * frequency, 0.5 / (frequency.max() - frequency.min()), start
     for _ in range(steps):
@@ -113,13 +112,13 @@ def estimate_clutter_synchronisation(
     *,
     assess: bool = True,
 ) -> Estimate:
-    """Estimate the clock phase of each pulse from the echo of what is at rest.
+    """Estimate the clock phase of each pulse from the echo of scatterers at rest.
 
-    Every range cell counts in blocks of slow time by how well each pulse predicts the next one:
-    most of all bright places at rest, such as islands and ships at anchor, but also a sea far above
-    the noise. Cells in which something moves are badly predicted and hardly count. A constant phase
-    cannot be determined, and a phase that grows linearly with time displaces the whole scene along
-    track: both are left out. Not differentiable.
+    Every range cell is weighted, in blocks of slow time, by how well each pulse predicts the next
+    one. Bright places at rest, such as islands and ships at anchor, have the most weight, but a sea
+    far above the noise contributes as well. Cells in which something moves are badly predicted and
+    have hardly any weight. A constant phase cannot be determined, and a phase that grows linearly
+    with time displaces the whole scene along track: both are left out. Not differentiable.
 
     Args:
         data: Range-compressed, balanced channels with the transmit range removed from the phase,
@@ -138,7 +137,7 @@ def estimate_clutter_synchronisation(
     Raises:
         TypeError: If the samples are not complex64 or complex128.
         ValueError: If there are no samples, a sample is not finite, or the channels are not those
-            of the radar, or if the radar has one channel, there are fewer than 4 pulses, or
+            of the radar. Also if the radar has one channel, there are fewer than 4 pulses, or
             `band_hz` or `block_s` is not positive.
     """
     data = checked_channels(data, radar, "estimate_clutter_synchronisation", "channel, pulse, range")
@@ -159,20 +158,22 @@ def estimate_clutter_synchronisation(
         power, fit = (_block_sums(x.abs().square().sum(-3), block) for x in (later, earlier))
         product = (later * earlier.conj()).sum(-3)
         weight, turn = 1 / power.clamp_min(TINY), product[..., 0]
-        for _ in range(6):  # further rounds change the phases by less than a tenth of their deviation
+        # further rounds change the phases by less than a tenth of their standard deviation
+        for _ in range(6):
             turn = torch.sgn((weight[..., block, :] * product).sum(-1))
             error = power + fit - 2 * _block_sums((product * turn[..., None].conj()).real, block)
-            # falls with the cube of the error: cells that move by a part of a wavelength in a
-            # pulse would bias the phases otherwise
+            # The weight falls with the cube of the error. Otherwise cells that move by a part of a
+            # wavelength in a pulse would bias the phases.
             weight = (power - error).clamp_min(0).square() / error.clamp_min(TINY) ** 3
         phase = _phase_without_line(turn)
         if not assess:
             return Estimate({"phase_rad": phase}, outcome=Outcome.NOT_ASSESSED.like(phase[..., 0]))
-        # the deviation by four parts of the range cells; neighbouring cells are alike
+        # standard deviation from four parts of the range cells; neighbouring cells, which are
+        # correlated, are in the same part
         parts, cell = 4, torch.arange(data.shape[-1], device=data.device)
         sums = torch.zeros(*turn.shape, parts, dtype=product.dtype, device=data.device)
         sums = sums.index_add(-1, cell // 8 % parts, (weight[..., block, :] * product).to(sums)).movedim(-1, -2)
-        # jackknife: what changes without a part, so that one that dominates counts fully
+        # jackknife: the change when a part is left out, so that a part that dominates counts fully
         left = sums.sum(-2, keepdim=True) - sums
         off = _phase_without_line(torch.sgn(left)) - phase[..., None, :]
         std = (off.square().sum(-2).mean(-1) * ((parts - 1) / parts)).sqrt()
@@ -183,7 +184,9 @@ def estimate_clutter_synchronisation(
 
 
 def _phase_without_line(turn: Tensor) -> Tensor:
-    """Return phases (..., pulse) by the phasors (..., pulse - 1) of their steps, without a line."""
+    """Add up the steps of the phase from phasors (..., pulse - 1) to phases (..., pulse), and
+    remove their line.
+    """
     step = torch.angle(turn * torch.sgn(turn.sum(-1, keepdim=True)).conj())
     phase = torch.nn.functional.pad(step.to(torch.float64).cumsum(-1), (1, 0))
     time = torch.linspace(-1, 1, phase.shape[-1], dtype=torch.float64, device=turn.device)
@@ -195,8 +198,8 @@ def _predicted(data: Tensor, radar: BistaticRadar, band_hz: float, snr_db: float
     """Return pulses and their predictions from the pulse before, whitened.
 
     Both have the shape (..., channel, n - 1, range). The covariance of two channels is that of a
-    flat Doppler spectrum at the distance of the places at which they receive: the channel at dx
-    lies dx behind, and all move on by the way of the receiver in a pulse interval.
+    flat Doppler spectrum at the distance of the places at which they receive. The channel at dx
+    lies dx behind, and all channels move on with the receiver from pulse to pulse.
     """
     at, per_pulse_m = radar.channels_at(data.device), radar.speed_m_s / radar.prf_hz
     apart_m = at - at[:, None]
@@ -298,7 +301,7 @@ class EstimateSynchronisation(ChannelStage):
 
 
 class ClutterSynchronisation(Stage):
-    """Stage that estimates the clock phase of each pulse from the echo of what is at rest.
+    """Stage that estimates the clock phase of each pulse from the echo of scatterers at rest.
 
     >>> from torchsar import Draws, echo, multichannel, radar, scene
     >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)

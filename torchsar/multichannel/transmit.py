@@ -120,7 +120,8 @@ class RemoveTransmitRange(ChannelStage):
         """Remove the transmit range from the phase of channels (channel, pulse[, range])."""
         pulse = signal.axis("pulse")
         left = neglected_transmit_phase_rad(self.radar, max(self.order, 1), pulse.n * pulse.step)
-        if left > 0.3:  # rad, well below the pi / 4 at which a quadratic phase broadens the response
+        # limit in rad, well below the pi / 4 at which a quadratic phase broadens the response
+        if left > 0.3:
             warnings.warn(
                 f"the transmit range beyond order {self.order} contributes a phase of {left:.2g} rad at "
                 f"the ends of the data; raise the order to {len(self.radar.transmit_range)}",

@@ -26,7 +26,7 @@ from torchsar.core import Estimate, Outcome, Signal, Stage, checked_samples, uni
 from torchsar.repair.assess import assess_offsets, of_trials
 from torchsar.repair.jitter import MIN_GAP, correct_jitter_exact, smallest_gap, uncrossed
 
-# standard deviation of a share that may have any value between 0 and 1, about
+# least standard deviation of a share that means that it may have any value between 0 and 1
 _MOST_SHARE = 0.3
 
 

@@ -102,7 +102,7 @@ def along_track_velocity(
         raise ValueError(
             f"half_m_s of a search along track must be positive, got {half_m_s}; omit the stage where u_a_m_s is known"
         )
-    # raises ValueError for a search up to the speed of the receiver
+    # this call raises ValueError for a search that reaches the speed of the receiver
     PointMotion.of(radar, data, 0.0, start.u_a_m_s + half_m_s)
     data = data.to(torch.complex128)
     time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
@@ -114,7 +114,7 @@ def along_track_velocity(
     aperture, uneven = seen_aperture(data, radar, replace(start, u_a_m_s=u_a), aperture)
     if bool(uneven.any()):
         u_a, energy, curvature, ended = _best(data, radar, start, aperture, centre, offsets)
-    # the ends of the aperture move with u_a from pulse to pulse: they are kept from here on
+    # the ends of the aperture would move with u_a from pulse to pulse; from here on they are fixed
     seen = Kept(aperture.weight(radar, replace(start, u_a_m_s=u_a), time_s))
     for _ in range(fine):
         step = 2 * step / 5
@@ -176,7 +176,7 @@ def _assessed(
     curvature: Tensor,
     ended: Tensor,
 ) -> Estimate:
-    """Add standard deviation and outcome to the maximum."""
+    """Assess the maximum, and form an estimate with standard deviation and outcome."""
     time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
     weight = aperture.weight(radar, motion, time_s)[..., None, :]
     lit = (weight != 0).expand(data.shape)
@@ -184,7 +184,7 @@ def _assessed(
     deramped = data * point_phasor(radar, motion, time_s, data.dtype).conj()
     tone_hz = tone_frequency(deramped * weight, radar.prf_hz)
     still = deramped * unit_phasor(-tone_hz[..., None, None] * time_s, data.dtype)
-    # each channel has its amplitude
+    # each channel has an amplitude of its own
     amplitude = (still * weight).sum(-1, keepdim=True) / weight.square().sum(-1, keepdim=True).clamp_min(TINY)
     beside = noise_beside(still - amplitude * weight, weight, amplitude, radar.channels + 2)
     spread = beside.diagonal(dim1=-2, dim2=-1).mean(-1) / curvature.clamp_min(TINY)
@@ -282,14 +282,15 @@ def interfered(
 
 
 def _begun(data: Tensor, radar: BistaticRadar, start: PointMotion, time_s: Tensor) -> PointMotion:
-    """Take the first pass from the slant-range speed at which the strongest tone is sharpest.
+    """Find the slant-range speed for the first pass, at which the strongest tone is sharpest.
 
     The cubic phase of a point grows with its speed, and would favour weaker points of less speed.
     """
     span, even = radar.ambiguous_velocity_m_s, torch.ones_like(time_s)
     best = start.each(lambda value: value.expand(data.shape[:-2]))
     most = torch.zeros(data.shape[:-2], dtype=torch.float64, device=data.device)
-    # chosen: 3 m/s from the next start, the cubic phase loses at most 1 dB of the tone
+    # nine starts, by choice: at 3 m/s from the nearest one, the cubic phase lowers the tone by at
+    # most 1 dB
     for offset in torch.linspace(-span / 2, span / 2, 9, dtype=torch.float64, device=data.device):
         there = replace(best, u_r_m_s=(start.u_r_m_s + offset).expand(most.shape))
         deramped = data * point_phasor(radar, there, time_s, data.dtype).conj()
@@ -301,13 +302,13 @@ def _begun(data: Tensor, radar: BistaticRadar, start: PointMotion, time_s: Tenso
 
 
 def _improved(data: Tensor, radar: BistaticRadar, motion: PointMotion, weight: Tensor, time_s: Tensor) -> PointMotion:
-    """Take one pass: estimate tone and phase slope, and update the motion."""
+    """Make one pass: estimate tone and phase slope, and update the motion."""
     deramped = data * point_phasor(radar, motion, time_s, data.dtype).conj() * weight[..., None, :]
     tone_hz = tone_frequency(deramped, radar.prf_hz)
     turn = torch.exp(-2j * math.pi * tone_hz[..., None] * time_s)
     across = _slope((deramped * turn[..., None, :]).sum(-1), radar.channels_at(data.device))
     dy = -across * radar.wavelength_m * motion.range_m / (2 * math.pi)
-    # tone = du_r / lambda + v dy / (lambda R0), slope = -2 pi dy / (lambda R0)
+    # the tone is du_r / lambda + v dy / (lambda R0), the slope -2 pi dy / (lambda R0)
     du = radar.wavelength_m * tone_hz - motion.along_m_s * dy / motion.range_m
     return replace(motion, u_r_m_s=motion.u_r_m_s + du, y0_m=motion.y0_m + dy)
 
@@ -324,7 +325,8 @@ def tone_frequency(tones: Tensor, rate_hz: float) -> Tensor:
     Returns:
         Frequency in Hz within +-rate / 2, shape (...,).
     """
-    # padded four times, the parabola errs by at most 0.004 of a Doppler cell, unpadded by 0.23
+    # padded four times, the parabola has an error of at most 0.004 of a Doppler cell, unpadded one
+    # of 0.23
     length = smooth_length(4 * tones.shape[-1])
     power = torch.fft.fft(tones, length).abs().square().sum(-2)
     at = power.argmax(-1, keepdim=True)
@@ -344,7 +346,7 @@ def _slope(values: Tensor, position_m: Tensor) -> Tensor:
     else:
         weight = step.abs() * gap_m
         rough = (torch.angle(step) * weight).sum(-1) / (weight * gap_m).sum(-1).clamp_min(TINY)
-    # the phases that remain are small: weighted least squares about their mean
+    # the remaining phases are small, so that weighted least squares about their mean suffice
     values = values * torch.exp(-1j * rough[..., None] * position_m)
     phase = torch.angle(values * values.sum(-1, keepdim=True).conj())
     weight = values.abs()
@@ -366,7 +368,7 @@ def _fit_at(data: Tensor, radar: BistaticRadar, motion: PointMotion, weight: Ten
     ).clamp_min(1)
     level = amplitude[..., None, None]
     beside = noise_beside(deramped - level * weight, weight, level, 3)
-    # derivatives by u_r and y0 of tone and phase slope; their other effects are not used
+    # derivatives of tone and phase slope by u_r and y0; other effects of u_r and y0 are not used
     v, near = (x[..., None, None] for x in (motion.along_m_s, motion.range_m))
     by_y0 = (v * time_s - radar.channels_at(time_s.device)[:, None]) / near
     slopes = 2 * math.pi / radar.wavelength_m * torch.stack([time_s.expand_as(by_y0), by_y0], -3)

@@ -1,4 +1,6 @@
-"""Expected amplitude of the echo of a moving point over slow time, and the one that data show."""
+"""Expected amplitude of the echo of a moving point over slow time, and the amplitude that the data
+show.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +55,8 @@ class Dwell:
         Returns:
             1 within the duration and 0 outside, float64 (..., pulse).
         """
-        since = time_s - (motion.y0_m / motion.along_m_s).detach()[..., None]  # broadside
+        # time since the point was at broadside
+        since = time_s - (motion.y0_m / motion.along_m_s).detach()[..., None]
         return (since.abs() < self.duration_s / 2).to(torch.float64)
 
 
@@ -101,7 +104,8 @@ class Kept:
 
 @dataclass(frozen=True)
 class SeenAperture:
-    """Expected amplitude, in some trials times a profile over slow time that the data have shown.
+    """Expected amplitude, multiplied in some trials by a profile over slow time that was measured
+    in the data.
 
     Args:
         aperture: Expected amplitude.
@@ -113,14 +117,15 @@ class SeenAperture:
 
     def weight(self, radar: BistaticRadar, motion: PointMotion, time_s: Tensor) -> Tensor:
         """Return the expected amplitude times the profile, see `Dwell.weight`."""
-        more = max(0, motion.trial_dims + 1 - self.profile.ndim)  # several hypotheses per trial
+        # dimensions for several hypotheses per trial
+        more = max(0, motion.trial_dims + 1 - self.profile.ndim)
         return self.aperture.weight(radar, motion, time_s) * self.profile[(..., *[None] * more, slice(None))]
 
 
-# what stages take, and what they expect by default
+# type of the apertures that stages accept, and the default
 Expected = Dwell | ElementBeam
 ELEMENT_BEAM = ElementBeam()
-# Expected amplitude of the echo of a point, centred on the time at which it is at broadside.
+# expected amplitude of the echo of a point, centred on the time at which it is at broadside
 Aperture = Dwell | ElementBeam | Kept | SeenAperture
 
 
@@ -132,15 +137,13 @@ def lit_as_expected(
     aperture: Aperture,
     whitening: Whitening | None = None,
 ) -> Tensor:
-    """Tell whether the echo of a point has the expected amplitude over the whole aperture.
+    """Decide whether the echo of a point has the expected amplitude over the whole aperture.
 
     The aperture is divided into eight parts of equal expected energy, and the amplitude a_s of the
-    point is fitted in each. Where the point is seen in a share of the parts only, because it enters
-    or leaves the beam, is lit for a shorter time, or migrates to another range line,
-
-        (sum |a_s|)^2 / (8 sum |a_s|^2)
-
-    is that share. Standard deviations that assume the whole aperture are then too small.
+    point is fitted in each. The point may be illuminated in a share of the parts only, because it
+    enters or leaves the beam, is lit for a shorter time, or migrates to another range line. Then
+    (sum |a_s|)^2 / (8 sum |a_s|^2) is that share. Standard deviations that assume the whole
+    aperture are then too small.
 
     Args:
         data: Channels with the transmit range removed, shape (..., channel, pulse), complex.
@@ -152,7 +155,7 @@ def lit_as_expected(
     Returns:
         True where this share is at least 0.8, bool (...,).
     """
-    # each of 8 parts has 10 dB at the SNR of 19 dB from which on a point counts as detected
+    # each of 8 parts has 10 dB at the SNR of 19 dB from which a point counts as detected
     amplitude = _Pulses.of(data, radar, motion, aperture, 8, whitening).amplitudes(8)
     squares = 8 * amplitude.square().sum(-1)
     # noise at this SNR lowers the share to 0.93, an aperture lit for 75 % to 0.75
@@ -188,8 +191,8 @@ def seen_aperture(
     pulses = _Pulses.of(data, radar, motion, aperture, 32, whitening)
     amplitude = pulses.amplitudes(32)
     level = amplitude / amplitude.amax(-1, keepdim=True).clamp_min(TINY)
-    # beyond a dark part there is noise, whose phase far from the point would bend the fit
-    # (chosen: noise in a dark part rarely reaches 0.35 where the point is detected)
+    # Beyond a dark part there is only noise, whose phase far from the point would distort the fit.
+    # The limit is a choice: noise in a dark part rarely reaches 0.35 where the point is detected.
     gaps = (level < 0.35).cumsum(-1)
     lit = (level >= 0.35) & (gaps == gaps.gather(-1, level.argmax(-1, keepdim=True)))
     return SeenAperture(aperture, torch.where(uneven[..., None], pulses.ended(level, lit), 1.0)), uneven
@@ -197,7 +200,7 @@ def seen_aperture(
 
 @dataclass(frozen=True)
 class _Pulses:
-    """What each pulse adds to the correlation of the data with the echo, and to its energy.
+    """Contribution of each pulse to the correlation of the data with the echo, and to its energy.
 
     In clutter, both are those of the matched filter in clutter. The parts have equal expected
     energy. Each tensor has the shape (..., pulse).
@@ -226,7 +229,7 @@ class _Pulses:
         value, energy = ((echo.conj() * x).sum(-2) for x in filtered)
         energy = energy.real.clamp_min(0)
         before = energy.cumsum(-1) - energy / 2
-        # samples that are NaN are refused later, and until then must not become an index
+        # samples that are NaN are rejected later, and until then must not become an index
         share = (before / energy.sum(-1, keepdim=True).clamp_min(TINY)).nan_to_num()
         part = (parts * share).floor().clamp(0, parts - 1).long()
         return _Pulses(value, energy, part)
@@ -240,9 +243,9 @@ class _Pulses:
     def ended(self, level: Tensor, lit: Tensor) -> Tensor:
         """Profile (..., pulse) of the lit parts, which follow each other, with levels (..., part).
 
-        If there are three or more, the ends are those pulses of the first and last part and of the
-        parts beside them between which the point explains most energy. There the level is that of
-        the next part inside.
+        If there are three or more, each end of the profile is a pulse in the outermost lit part or
+        a part beside it. The two ends are those between which the point explains most energy. The
+        level near an end is that of the next part inside.
         """
         index = torch.arange(level.shape[-1], device=level.device)
         first = lit.to(torch.int8).argmax(-1, keepdim=True)
@@ -255,7 +258,9 @@ class _Pulses:
         power = torch.where(near, wide.square() * self.energy, 0)
 
         def from_to(begin: Tensor, end: Tensor, tried: Tensor) -> Tensor:
-            """Index of the tried pulse with most explained energy, given sums (2, ..., pulse)."""
+            """Index of the tried pulse with the most explained energy, given sums (2,
+            ..., pulse).
+            """
             found, power = (end - begin).unbind(0)
             explained = found.clamp_min(0).square() / power.clamp_min(TINY)
             return torch.where(tried, explained, -1).argmax(-1, keepdim=True)

@@ -23,12 +23,14 @@ from torchsar.multichannel.velocity.model import DETECTED_DB, Found, point_phaso
 from torchsar.multichannel.velocity.whitening import Whitening
 from torchsar.radar import BistaticRadar
 
-# Log-likelihood by which other numbers of pulse rates must be worse, by choice: a chance of e^-10.
+# log-likelihood by which other numbers of pulse rates must be worse, by choice: a chance of e^-10
 _RESOLVED = 10.0
-# Half width and step of the search in u_a: an assumed u_a may be wrong by the usual +-20 m/s.
+# half width and step of the search in u_a; an assumed u_a may be wrong by the usual +-20 m/s
 _U_A_HALF_M_S, _U_A_STEP_M_S = 22.0, 0.5
 _FASTEST = 0.9  # largest u_a tried, relative to the speed of the receiver
-_STEPS = 6  # Gauss-Newton steps of a hypothesis, found by trial: more add less than the noise of a sample
+# Gauss-Newton steps of a hypothesis, found by trial; further ones gain less energy than the noise
+# of a sample
+_STEPS = 6
 
 
 @torch.no_grad()
@@ -57,14 +59,14 @@ def outcome_of_point(
         whitening: Clutter covariance, None for white noise.
 
     Returns:
-        Codes of shape (...,): `EMPTY` for zeros, `NOISE` below an SNR of 19 dB over all samples,
-        `MISFIT` where the illumination is not understood (see `lit_as_expected`) or only another
-        along-track speed than the assumed one rises above the noise, `AMBIGUOUS` where
-        another number of pulse rates explains the data as well, or one of `reasons`. With
-        `inside`, also `pulse_rates` of shape (...,): the number of PRFs to add to the Doppler,
-        -1, 0 or 1, and 0 where nothing is found.
+        Codes of shape (...,): `EMPTY` for zeros, and `NOISE` below an SNR of 19 dB over all
+        samples. `MISFIT` where the illumination does not agree with the expected one (see
+        `lit_as_expected`), or only another along-track speed than the assumed one rises above the
+        noise. `AMBIGUOUS` where another number of pulse rates explains the data as well. Or one of
+        `reasons`. With `inside`, also `pulse_rates` of shape (...,): the number of PRFs to add to
+        the Doppler, -1, 0 or 1, and 0 where nothing is found.
     """
-    # the ratio of zeros is -300 dB
+    # for zeros, the ratio is -300 dB
     empty, weak = found.snr_db < -250.0, found.snr_db < DETECTED_DB
     codes = [
         (Outcome.EMPTY, empty),
@@ -98,7 +100,8 @@ def _compared(
     assumed: bool,
     whitening: Whitening | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the number of pulse rates a fit is off, whether it is ambiguous, and the best SNR.
+    """Return the number of pulse rates by which a fit is wrong, whether it is ambiguous, and the
+    best SNR.
 
     Speeds that differ by lambda PRF differ in the cubic phase of the range history.
     """
@@ -106,12 +109,14 @@ def _compared(
     if assumed:
         unknowns = tuple(dict.fromkeys((*unknowns, "u_a_m_s")))
     time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
-    aperture = Kept(aperture.weight(radar, found.motion, time_s))  # energies are of the same pulses
+    # the energies compared are those of the same pulses
+    aperture = Kept(aperture.weight(radar, found.motion, time_s))
     fits = []
     for number in (-1, 0, 1):
         there = found.motion.each(lambda value: value.expand(data.shape[:-2]))
         u_r = there.u_r_m_s + number * radar.ambiguous_velocity_m_s
-        if "u_a_m_s" in unknowns:  # keep the curvature of the phase
+        # the along-track speed is adapted, so that the curvature of the phase remains the same
+        if "u_a_m_s" in unknowns:
             u_a = there.speed_m_s - (there.square_m2_s2 - u_r.square()).clamp_min(1.0).sqrt()
             there = replace(there, u_a_m_s=u_a.clamp_max(_FASTEST * there.speed_m_s))
         there, steps = replace(there, u_r_m_s=u_r), _STEPS if number or assumed else 0
@@ -129,13 +134,13 @@ def _compared(
 def _sharpest(data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture: Aperture) -> PointMotion:
     """Return the motion with the along-track speed and position of the strongest tone near it.
 
-    An error of the along-track speed leaves a quadratic phase, one of the position a tone.
+    An error of the along-track speed causes a quadratic phase, and one of the position a tone.
     """
     time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
-    # Hz per metre of position, and Hz/s per m/s of half the speed
+    # rate: Hz per metre of position; middle: Hz/s per m/s of half the speed
     rate = motion.along_m_s / (radar.wavelength_m * motion.range_m)
     middle = radar.speed_m_s / (radar.wavelength_m * radar.reference_range_m)
-    # neighbouring pulses are added as far as the frequencies of the tried chirps allow
+    # as many neighbouring pulses are added as the frequencies of the tried chirps allow
     factor = int(radar.prf_hz**2 / (2 * _U_A_HALF_M_S * middle * data.shape[-1]))
     factor = min(max(1, factor), data.shape[-1])
     echo = data * point_phasor(radar, motion, time_s, data.dtype).conj()

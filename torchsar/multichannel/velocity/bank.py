@@ -49,7 +49,7 @@ class Search:
     u_r_m_s: float = 21.6
     u_a_m_s: float = 20.0
     y0_m: float = 150.0
-    # found by trial: at most 2 dB are lost between hypotheses, most of it by the step of u_a
+    # found by trial; at most 2 dB are lost between hypotheses, most of them by the step of u_a
     u_r_step_m_s: float = 3.0
     u_a_step_m_s: float = 0.5
 
@@ -102,7 +102,7 @@ def bank_search(
     best = PointMotion.of(radar, data, 0.0, u_a_m_s, 0.0, range_m)
     best = best.each(lambda value: value.expand(data.shape[:-2]))
     energy = torch.zeros(data.shape[:-2], dtype=torch.float64, device=data.device)
-    # 64 MiB limit the memory of a block of hypotheses
+    # blocks of hypotheses take at most 64 MiB
     hypotheses, size = [], max(1, (64 << 20) // (32 * data.numel()))
     for u_r in _steps(search.u_r_m_s, search.u_r_step_m_s, data.device):
         for offsets in _steps(search.u_a_m_s, search.u_a_step_m_s, data.device).split(size):
@@ -111,14 +111,15 @@ def bank_search(
             if image_s is not None:
                 there = replace(there, y0_m=there.position_m(per_trial(image_s, 1, data)))
             hypotheses.append(there)
-    # a search that is the same for all trials needs the pulses of its aperture only
+    # if the search is the same for all trials, only the pulses of its aperture are needed
     few = whitening is None and all(there.y0_m.ndim <= 1 for there in hypotheses)
     parts = (
         _illuminated([aperture.weight(radar, there, time_s) for there in hypotheses])
         if few
         else [slice(None)] * len(hypotheses)
     )
-    # largest change of the residual tone with position, infinite inside vmap, which reads no values
+    # largest change of the residual tone with position; infinite inside vmap, where values cannot
+    # be read
     rates = [(each.along_m_s / (radar.wavelength_m * each.range_m)).max() for each in hypotheses]
     fastest_hz_m = host_values(torch.stack(rates), math.inf)
     for there, pulses, fastest in zip(hypotheses, parts, fastest_hz_m, strict=True):
@@ -152,7 +153,7 @@ def _best_tone(
     fastest_hz_m: float,
     whitening: Whitening | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the greatest normalised correlation per trial, its position y0 and its u_a.
+    """Return the greatest normalised correlation per trial, and its position y0 and speed u_a.
 
     fastest_hz_m: Largest change of the residual tone with position.
     """
@@ -166,13 +167,15 @@ def _best_tone(
     bins = torch.arange(-half, min(half + 1, length - half), device=prepared.device)
     spectrum = torch.fft.fft(tones, length)[..., bins]
     shift = bins.to(torch.float64) * (rate_hz / length) * scale / motion.along_m_s[..., None]
-    # channels with the phases of a point; the slope is in turns per metre of channel position
+    # channels are added with the phases of a point; the slope is in cycles per metre of channel
+    # position
     aligned = torch.zeros_like(spectrum[..., 0, :])
     for x, dx in zip(spectrum.unbind(-2), radar.channel_m, strict=True):
         aligned = aligned + x * unit_phasor(shift / scale * dx, x.dtype)
     energy = weight.square().sum(-1) * radar.channels
     if whitening is not None:
-        # that of the middle model serves for all, since it hardly depends on the along-track speed
+        # the energy of the middle model is used for all, because it hardly depends on the
+        # along-track speed
         middle = model[..., model.shape[-3] // 2, :, :].to(torch.complex128)
         middle = middle.expand(*whitening.factor.shape[:-3], *middle.shape[-2:])
         energy = whitening.applied(middle).abs().square().sum((-2, -1))[..., None]
@@ -189,19 +192,23 @@ def _best_tone(
 
 
 def _illuminated(weights: list[Tensor]) -> list[slice]:
-    """Return, for weights (..., pulse) of blocks of hypotheses, the slices from the first to the
-    last pulse with amplitude in any hypothesis of the block.
+    """Return, for weights (..., pulse) of blocks of hypotheses, the slice of the illuminated pulses
+    of each block.
+
+    It reaches from the first to the last pulse with amplitude in any hypothesis of the block.
     """
     lit = torch.stack([(weight != 0).flatten(0, -2).any(0) for weight in weights]).to(torch.uint8)
     n = lit.shape[-1]
-    # the first largest element: of a block without amplitude, all pulses
+    # argmax returns the first of equal elements, so that a block without amplitude gets all pulses
     ends = host_values(torch.stack([lit.argmax(-1), n - lit.flip(-1).argmax(-1)], -1), 0)
-    # inside vmap, where values cannot be read, all pulses as well
+    # inside vmap, where values cannot be read, blocks get all pulses too
     return [slice(first, end or n) for first, end in zip(ends[::2], ends[1::2], strict=True)]
 
 
 def _decimated(tones: Tensor, prf_hz: float, highest_hz: float) -> tuple[Tensor, float]:
-    """Sum neighbouring pulses as far as tones up to highest_hz allow, and return the new rate."""
+    """Sum as many neighbouring pulses as tones up to highest_hz allow, and return the sums and the
+    new rate.
+    """
     factor = max(1, int(prf_hz / (3 * highest_hz))) if highest_hz > 0 else 1
     if factor == 1:
         return tones, prf_hz

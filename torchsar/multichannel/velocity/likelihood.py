@@ -198,7 +198,7 @@ class PointLikelihood:
 
 
 def _white(deramped: Tensor, weight: Tensor, slopes: Tensor) -> PointFit:
-    """Fit in white noise on deramped data, which are constant where the motion is right."""
+    """Fit a point in white noise to deramped data, which are constant if the motion is correct."""
     total = weight.square().expand(deramped.shape).sum((-2, -1)).clamp_min(TINY)
     amplitude = (weight * deramped).sum((-2, -1)) / total
     centred = centred_slopes(slopes, weight)
@@ -213,7 +213,8 @@ def _white(deramped: Tensor, weight: Tensor, slopes: Tensor) -> PointFit:
 
 
 def _coloured(data: Tensor, model: Tensor, tilted: Tensor, columns: Tensor) -> PointFit:
-    """Fit on whitened data, model, model times slow time, and derivatives.
+    """Fit a point to whitened data, given the whitened model, model times slow time, and
+    derivatives.
 
     In clutter, a displaced expected amplitude displaces the point. The amplitude may therefore grow
     linearly over slow time, by a real factor.
@@ -249,12 +250,14 @@ def _climbed(
     """
     fit = fit_at(motion)
     total = data.abs().square().sum((-2, -1))
-    stuck = torch.zeros_like(fit.energy, dtype=torch.bool)  # no part of the step gained anything
-    every = 1 if data.device.type == "cpu" else 4  # steps between two decisions whether to stop, by choice
+    # true where no part of the step gained energy
+    stuck = torch.zeros_like(fit.energy, dtype=torch.bool)
+    # steps between two decisions whether to stop, by choice
+    every = 1 if data.device.type == "cpu" else 4
     for number in range(steps):
         step = solved(fit.normal, fit.gradient[..., None])[..., 0]
         noise = (total - fit.energy).clamp_min(0) / data.shape[-2:].numel()
-        # no step for a gain below that of 3e-4 standard deviations, or below rounding
+        # no step is taken for a gain below that of 3e-4 standard deviations, or below rounding
         pending = ~stuck & ((step * fit.gradient).sum(-1) > 1e-7 * noise + 1e-13 * fit.energy)
         if number % every == 0 and not bool(pending.any()):
             break
@@ -273,14 +276,16 @@ def _stepped(
 ) -> tuple[PointMotion, PointFit, Tensor]:
     """Take a step in the pending trials, halved or omitted where it explains less energy.
 
-    Returns also in which of these trials it was omitted.
+    Also returns in which of these trials it was omitted.
     """
     begin, before = motion, fit.energy
     step = step.reshape(*motion.u_r_m_s.shape, len(unknowns))
-    if "u_a_m_s" in unknowns:  # at most a tenth of the speed along track past the point
+    # a step changes the along-track speed past the point by at most a tenth
+    if "u_a_m_s" in unknowns:
         along = step[..., unknowns.index("u_a_m_s")].abs().clamp_min(TINY)
         step = step * (0.1 * motion.along_m_s / along).clamp_max(1.0)[..., None]
-    for halvings in range(4):  # whole, half, quarter, eighth; then it is omitted
+    # the whole step, a half, a quarter or an eighth of it; otherwise it is omitted
+    for halvings in range(4):
         there = moved(begin, 0.5**halvings * step, unknowns)
         fit_there = fit_at(there)
         better = pending & (fit_there.energy > before)
@@ -318,13 +323,15 @@ def fitted_together(
     time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
     weight = aperture.weight(radar, start, time_s)[..., None, :]
     fit_at = partial(_fit_of_points, data, radar, weight, time_s, unknowns)
-    motion, fit = _climbed(data, fit_at, start, unknowns, 8)  # by trial: points 10 dB apart converge
+    # by trial, points that differ by 10 dB converge in 8 steps
+    motion, fit = _climbed(data, fit_at, start, unknowns, 8)
     echoes = fit.amplitude[..., None, None] * weight * point_phasor(radar, motion, time_s, torch.complex128)
     left = data - echoes.sum(-3)
     noise = left.abs().square().mean((-2, -1))
     pairs = (-1, len(unknowns))
     covariance = covariance_of(fit.normal, noise).unflatten(-1, pairs).unflatten(-3, pairs)
-    own = covariance.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)  # (..., point, unknown, unknown)
+    # blocks of single points, (..., point, unknown, unknown)
+    own = covariance.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)
     energy = echoes.abs().square().sum((-2, -1))
     first = energy.argmax(-1)
     found = Found(
@@ -349,7 +356,7 @@ def _fit_of_points(
     left = x - (amplitude[..., None, :] @ s)[..., 0, :]
     slopes = phase_slopes(radar, motion, time_s, unknowns)
     columns = (amplitude[..., None, None, None] * 1j * slopes * echo[..., None, :, :]).flatten(-2).flatten(-3, -2)
-    # without the parts that other amplitudes would take up
+    # the parts that changes of the amplitudes would explain are removed
     columns = columns - solved(gram, s.conj() @ columns.mT).mT @ s
     return PointFit(
         amplitude,

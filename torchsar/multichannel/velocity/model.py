@@ -15,11 +15,11 @@ from torchsar.radar import BistaticRadar
 from torchsar.radar.bistatic import receive_range
 
 UNKNOWNS = ("u_r_m_s", "u_a_m_s", "y0_m")
-# Detection threshold over all samples, -15 dB per sample with three channels and 810 pulses: below
+# Detection threshold over all samples, -15 dB per sample with three channels and 810 pulses. Below
 # it the strongest tone is often one of noise.
 DETECTED_DB = 19.0
-TINY = torch.finfo(torch.float64).tiny  # keeps divisions by zero finite
-_ROUNDING = 1e-13  # added to the unit diagonal of normal matrices
+TINY = torch.finfo(torch.float64).tiny  # lowest divisor, against divisions by zero
+_ROUNDING = 1e-13  # term added to the unit diagonal of normal matrices
 
 
 def point_phasor(radar: BistaticRadar, motion: PointMotion, time_s: Tensor, dtype: torch.dtype) -> Tensor:
@@ -158,7 +158,8 @@ def noise_beside(left: Tensor, weight: Tensor, amplitude: Tensor, fitted: int, c
     """
     n = left.shape[-1]
     energy = weight.square().sum((-2, -1))
-    per_bin = energy.square() / weight.square().square().sum((-2, -1)).clamp_min(TINY) / n  # Doppler cells
+    # ratio for each bin, in Doppler cells
+    per_bin = energy.square() / weight.square().square().sum((-2, -1)).clamp_min(TINY) / n
     inside = torch.fft.fftfreq(n, 1 / n, dtype=torch.float64, device=left.device).abs() * per_bin[..., None] <= cells
     turned = (left * torch.polar(torch.ones_like(amplitude.abs()), -amplitude.angle())).imag
     spectrum = torch.fft.fft(weight * turned) * inside[..., None, :]
@@ -188,7 +189,7 @@ def covariance_in(noise: Tensor, slopes: Tensor, amplitude: Tensor) -> Tensor:
     flat = slopes.flatten(-2)
     unit, scale = _of_unit_diagonal(power * (flat @ flat.mT))
     spread = power / 2 * (flat @ (noise[..., None, :, :] @ slopes).flatten(-2).mT)
-    # where unknowns cannot be separated, rounding shall not make their deviation small
+    # where unknowns cannot be separated, rounding must not make their standard deviation small
     level = noise.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] / 2
     spread = scale[..., :, None] * spread * scale[..., None, :] + _ROUNDING * level * torch.eye(
         unit.shape[-1], dtype=unit.dtype, device=unit.device
@@ -234,7 +235,9 @@ def round_units(normal: Tensor) -> Tensor:
 
 
 def _of_unit_diagonal(normal: Tensor) -> tuple[Tensor, Tensor]:
-    """Return matrices of unit diagonal, with a floor, and the scale (..., n) on either side."""
+    """Return matrices scaled to unit diagonal, plus a small diagonal term, and the scale (..., n)
+    on either side.
+    """
     diagonal = normal.diagonal(dim1=-2, dim2=-1).real
     scale = torch.where(diagonal > 0, diagonal, 1.0).rsqrt()
     unit = normal * scale[..., :, None] * scale[..., None, :] + torch.diag_embed((diagonal <= 0).to(normal.dtype))

@@ -93,7 +93,7 @@ def moving_point_velocity(
     unknowns = UNKNOWNS if u_a_m_s is None else ("u_r_m_s", "y0_m")
     if u_a_m_s is not None:
         search = replace(search, u_a_m_s=0.0)
-    # the first search takes the integration time of Remote Sens. 2020, 12, 1703, Table 1
+    # the first search uses the integration time of Remote Sens. 2020, 12, 1703, Table 1
     coarse, u_a = aperture if isinstance(aperture, Dwell) else Dwell(4.5), 0.0 if u_a_m_s is None else u_a_m_s
     data = data.to(torch.complex128)
     job = _Job(data, radar, aperture, torch.ones_like(data[..., 0, :].real), coarse, search, u_a, range_m, unknowns)
@@ -106,12 +106,13 @@ def moving_point_velocity(
     plain, rest = white.refined(plain)
     if not bool(rest.coloured.any()):
         return white.estimate(plain, rest.coloured, disturbed, assess)
-    # what the fit in white noise shows of the aperture and of other points may be clutter
+    # the profile and the other points that a fit in white noise finds may be clutter
     clutter = sample_whitening(job.data, radar)
     job, found = job.as_seen(job.found(clutter), clutter)
     other, rest_of_other = job.refined(found)
-    # the smaller log determinant is likelier
-    first = ~rest.coloured | (rest.log_det <= rest_of_other.log_det)  # independent of the other trials
+    # the job with the smaller log determinant is likelier
+    # decided for each trial independently
+    first = ~rest.coloured | (rest.log_det <= rest_of_other.log_det)
     return white.or_other(job, first).estimate(
         _chosen_fit(plain, other, first),
         torch.where(first, rest.coloured, rest_of_other.coloured),
@@ -124,7 +125,7 @@ def moving_point_velocity(
 class _Job:
     """Data and settings of one estimate.
 
-    The aperture is the expected one times `profile` (..., pulse), which the data have shown;
+    The aperture is the expected one times `profile` (..., pulse), which was measured in the data.
     `coarse` is the aperture of the search.
     """
 
@@ -140,7 +141,7 @@ class _Job:
 
     @property
     def aperture(self) -> SeenAperture:
-        """Expected amplitude over slow time, as the data have shown it."""
+        """Expected amplitude over slow time, times the profile measured in the data."""
         return SeenAperture(self.expected, self.profile)
 
     def found(self, whitening: Whitening | None) -> Found:
@@ -150,7 +151,8 @@ class _Job:
         """
         start, _ = bank_search(self.data, self.radar, self.coarse, self.search, self.u_a_m_s, self.range_m, whitening)
         near = maximum_likelihood(self.data, self.radar, start, self.coarse, self.unknowns, whitening)
-        # half a step beside the nearest hypothesis, the fit may end beside the maximum
+        # the fit may end beside the maximum, so that it is also started half a step beside the
+        # nearest hypothesis
         for side in (-0.5, 0.5) if "u_a_m_s" in self.unknowns else ():
             beside = replace(start, u_a_m_s=start.u_a_m_s + side * self.search.u_a_step_m_s)
             other = maximum_likelihood(self.data, self.radar, beside, self.coarse, self.unknowns, whitening)
@@ -158,7 +160,9 @@ class _Job:
         return self.fitted(near.motion, whitening)
 
     def as_seen(self, found: Found, whitening: Whitening | None) -> tuple[_Job, Found]:
-        """Refit points that are lit in a part of the aperture only, and keep that part."""
+        """Fit points again that are lit in a part of the aperture only, and keep that part as the
+        profile.
+        """
         aperture, uneven = seen_aperture(self.data, self.radar, found.motion, self.expected, whitening)
         if not isinstance(aperture, SeenAperture):
             return self, found
@@ -166,16 +170,16 @@ class _Job:
         return job, _chosen_fit(job.fitted(found.motion, whitening), found, uneven)
 
     def or_other(self, other: _Job, first: Tensor) -> _Job:
-        """Take the data and the profile of another job where `first` is False."""
+        """Job that has the data and the profile of another job where `first` is False."""
         data = torch.where(first[..., None, None], self.data, other.data)
         return replace(self, data=data, profile=torch.where(first[..., None], self.profile, other.profile))
 
     def separated(self, found: Found) -> tuple[_Job, Found, Tensor]:
-        """Fit up to three further points together with the first, where these leave white noise.
+        """Fit up to three further points together with the first, where this leaves white noise.
 
-        Their echo is then removed from the data. A point of the same Doppler frequency is otherwise
-        taken for clutter, whose covariance over several Doppler bins does not describe it. Returns
-        also where there is such a point that cannot be separated.
+        Their echo is then removed from the data. Otherwise a point of the same Doppler frequency
+        would count as clutter, whose covariance over several Doppler bins does not describe it.
+        Also returns where there is such a point that cannot be separated.
         """
         job, whole = self, replace(self, profile=torch.ones_like(self.profile))
         tried = sample_whitening(self.left(found), self.radar).coloured
@@ -187,20 +191,20 @@ class _Job:
         found = _chosen_fit(self.resolved(found, None), found, tried)
         tried = tried & sample_whitening(self.left(found), self.radar).coloured
         points, left = found.motion.each(lambda value: value.expand(tried.shape)[..., None]), whole.left(found)
-        for _ in range(3):  # by choice: each takes a search of its own
+        for _ in range(3):  # at most three, by choice, because each needs a search
             further = replace(whole, data=left).found(None)
             share = further.energy / left.abs().square().sum((-2, -1)).clamp_min(TINY)
-            # clutter that fills 800 Doppler cells gives 0.01 to its strongest tone; a point just
-            # detected in noise gives 0.03
+            # Clutter that fills 800 Doppler cells has 0.01 of its energy in its strongest tone. A
+            # point just detected in noise has 0.03.
             tried = tried & (share > 0.02)
             if not bool(tried.any()):
                 break
-            # by choice a point rather than clutter, and more than the 0.001 of the energy of the
-            # point itself that the model of the echo of a wide chirp leaves
+            # By choice, this is a point rather than clutter. It also exceeds the 0.001 of the
+            # energy of the first point that the model of the echo of a wide chirp does not explain.
             clear = (share > 0.05) & (further.energy > 0.002 * found.energy)
             disturbed = disturbed | (tried & clear & self._overlap(found.motion, further.motion))
             points = points.each(lambda these, one: torch.cat([these, one[..., None]], -1), further.motion)
-            for _ in range(2):  # the second pass has the amplitudes at the positions found
+            for _ in range(2):  # the second pass uses the amplitudes at the positions found
                 points, own, others, left = fitted_together(self.data, self.radar, points, self.expected, self.unknowns)
             done = tried & ~sample_whitening(left, self.radar).coloured
             found, job, tried = (
@@ -212,12 +216,15 @@ class _Job:
         return job, found, disturbed
 
     def _overlap(self, motion: PointMotion, other: PointMotion) -> Tensor:
-        """Whether the Doppler frequencies of two points differ by less than eight Doppler cells."""
+        """True where the Doppler frequencies of two points differ by less than eight
+        Doppler cells.
+        """
         doppler_hz = [(m.u_r_m_s + m.along_m_s * m.y0_m / m.range_m) / self.radar.wavelength_m for m in (motion, other)]
         return (doppler_hz[0] - doppler_hz[1]).abs() < 8.0 / self.coarse.duration_s
 
     def refined(self, found: Found) -> tuple[Found, Whitening]:
-        """Repeat the fit up to two times with the covariance of its residual, and return both.
+        """Repeat the fit up to two times with the covariance of its residual, and return fit and
+        covariance.
 
         Trials whose residual is white noise keep their fit.
         """
@@ -230,7 +237,7 @@ class _Job:
         return found, whitening
 
     def left(self, found: Found) -> Tensor:
-        """Return the data without the fitted point."""
+        """Return the data after the echo of the fitted point is subtracted."""
         time_s = self.radar.pulse_axis(self.data.shape[-1]).values(self.data.device)
         weight = self.aperture.weight(self.radar, found.motion, time_s)[..., None, :]
         return self.data - found.amplitude[..., None, None] * weight * point_phasor(
@@ -268,7 +275,7 @@ class _Job:
         return maximum_likelihood(self.data, self.radar, start, self.aperture, self.unknowns, whitening, steps)
 
     def inside(self, motion: PointMotion) -> Tensor:
-        """Whether a motion lies within the search, bool (...,)."""
+        """True where a motion lies within the search, bool (...,)."""
         inside = motion.u_r_m_s.abs() <= self.search.u_r_m_s + self.search.u_r_step_m_s
         if "u_a_m_s" in self.unknowns:
             reach = self.search.u_a_m_s + self.search.u_a_step_m_s
@@ -278,7 +285,7 @@ class _Job:
     def estimate(
         self, found: Found, coloured: Tensor, disturbed: Tensor, assess: bool, whitening: Whitening | None = None
     ) -> Estimate:
-        """Form the estimate, and assess it; `disturbed` says where another point changes it."""
+        """Form the estimate, and assess it; `disturbed` is True where another point changes it."""
         found = self.resolved(found, whitening)
         if not assess:
             return estimate_of(found, None, {"coloured": coloured})
@@ -300,5 +307,5 @@ def _chosen_fit(a: Found, b: Found, first: Tensor) -> Found:
 
 
 def _beside(trials: Tensor, x: Tensor) -> Tensor:
-    """Return a tensor (...,) with dimensions of 1 in place of the further ones of x."""
+    """Reshape a tensor (...,), so that it has dimensions of 1 for the further dimensions of x."""
     return trials[(...,) + (None,) * (x.ndim - trials.ndim)]

@@ -239,14 +239,14 @@ class SignalIntensityRatio(ChannelStage):
         check_condition(self.radar, motion(start), self.rebuild, lines.dtype)
         reach = (high - low) / 2
         coarse, costs = grid_minimum(lambda u: -log_ratio(u), start, reach, 2 * round(reach / self.step_m_s) + 1)
-        # the tolerance is well below the 0.06 m/s of error without noise
+        # the tolerance is well below the error of 0.06 m/s without noise
         fine, _ = parabola_minimum(lambda u: -log_ratio(u), coarse, self.step_m_s / 2, 1e-4)
         has_data = lines.detach().abs().amax((-3, -2, -1)) > 0
         value = torch.where(has_data, fine.clamp(low, high), middle)
         if not self.assess:
             return Estimate({"u_r_m_s": value}, info={"log_ratio": -costs})
-        # Systematic error without noise, from echoes beyond the reconstructed bands: 0.035 m/s rms
-        # over velocities and positions, up to 0.06 m/s, of lambda PRF = 43 m/s.
+        # Systematic error without noise, from echoes beyond the reconstructed bands. It is 0.035
+        # m/s rms over velocities and positions, and up to 0.06 m/s, for lambda PRF = 43 m/s.
         std = _standard_deviation(log_ratio, fine, 8e-4 * self.radar.ambiguous_velocity_m_s)
         quality = torch.where(has_data, 1 - torch.exp(costs.amin(-1) - costs.median(-1).values), 0.0).clamp(0, 1)
         ended = (coarse - low).abs().minimum((coarse - high).abs()) <= self.step_m_s / 2
@@ -268,7 +268,7 @@ class SignalIntensityRatio(ChannelStage):
         apart = (motion.u_r_m_s - tone.motion.u_r_m_s).abs()
         within = torch.full_like(apart > 0, not self.bounded)
         outcome, info = outcome_of_point(line, radar, tone, aperture, reasons, lambda _: within, assumed=True)
-        # by chance they differ by up to two predicted deviations, by convention
+        # by chance they may differ by up to two predicted standard deviations, by convention
         return torch.where(apart > 2.0 * std, apart, std), outcome, info
 
 
@@ -279,14 +279,14 @@ def _standard_deviation(log_ratio: Callable[[Tensor, int], Tensor], value: Tenso
     Slope and curvature are taken over the interval about the maximum in which noise may displace
     it. The systematic error `rest_m_s` is included.
 
-    The half steps were found by trial: with a fixed one of 0.5 m/s, errors are 0.6, 0.75 and 1.0 of
-    the prediction at 10, 13 and 17 dB per sample; with 1 m/s they are 1.0, 1.2 and 1.8. The second
-    is that at which the maximum has fallen by 1.8 standard deviations of the noise of ln Gamma:
-    predictions then hold within 10 % from 10 to 25 dB.
+    The half steps were found by trial. With a fixed one of 0.5 m/s, errors are 0.6, 0.75 and 1.0 of
+    the prediction at 10, 13 and 17 dB per sample. With 1 m/s they are 1.0, 1.2 and 1.8. The second
+    one is the step at which the maximum has fallen by 1.8 standard deviations of the noise of ln
+    Gamma. Predictions then hold within 10 % from 10 to 25 dB.
     """
     step = torch.full_like(value, 0.75)
     spread, bend = _slope_and_bend(log_ratio, value, step)
-    noise = math.sqrt(2) * step * spread  # of log Gamma at one speed
+    noise = math.sqrt(2) * step * spread  # noise of log Gamma at one speed
     step = torch.where(bend > 0, (2 * 1.8 * noise / torch.where(bend > 0, bend, 1)).sqrt(), math.inf)
     spread, bend = _slope_and_bend(log_ratio, value, step.clamp(0.4, 1.5))
     std = torch.where(bend > 0, spread / torch.where(bend > 0, bend, 1), math.inf)

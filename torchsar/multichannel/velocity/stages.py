@@ -93,7 +93,8 @@ def gradient_likelihood(
     aperture, _ = seen_aperture(data, radar, start, aperture)
     energy = data.abs().to(torch.float64).square().sum((-2, -1)).clamp_min(TINY)
     at_start = maximum_likelihood(data, radar, start, aperture, unknowns, steps=0)
-    # the phases of the unknowns are nearly alike: in whitened units the objective is isotropic
+    # the phases of the unknowns are strongly correlated; in whitened units the objective is
+    # isotropic
     time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
     weight = aperture.weight(radar, at_start.motion, time_s)
     echo = weight[..., None, :] * point_phasor(radar, at_start.motion, time_s, torch.complex128)
@@ -145,7 +146,7 @@ class _Velocity(Stage):
         """
         refuse_shifted(self.radar, signal.axis("pulse"))
         channels, pulses = signal.axes[0].n, signal.axes[1].n
-        # three pulses define a tone and its curvature, a fourth shows noise
+        # three pulses determine a tone and its curvature, a fourth shows noise
         if channels != self.radar.channels or pulses < 4:
             raise ValueError(
                 f"{type(self).__name__} expects {self.radar.channels} channels as in the radar's "
@@ -262,9 +263,9 @@ class AlongTrackAutofocus(_Velocity):
             `u_a_m_s` of shape (...,), see `along_track_velocity`.
 
         Raises:
-            ValueError: If the half width of the search is not positive, the search reaches the
-                speed of the receiver, the data have other channels than the radar or fewer than 4
-                pulses, or slow time is not zero at pulse n // 2.
+            ValueError: If the half width of the search is not positive, or the search reaches the
+                speed of the receiver. Also if the data have other channels than the radar or fewer
+                than 4 pulses, or slow time is not zero at pulse n // 2.
         """
         return along_track_velocity(*self.begin(signal, u_r_m_s, 0.0, y0_m), self.half_m_s, assess=self.assess)
 
@@ -331,7 +332,8 @@ class LikelihoodVelocity(_Velocity):
         found = maximum_likelihood(data, radar, start, aperture, self.unknowns)
         if not self.assess:
             return estimate_of(found)
-        # from a start too far away, another step would explain more than the noise of a few samples
+        # if the start was too far away, another step would explain more than the noise of a few
+        # samples
         again = maximum_likelihood(data, radar, found.motion, aperture, self.unknowns, steps=1)
         moving = again.energy - found.energy > 4 * found.noise_power + 1e-9 * found.energy
         outcome, _ = outcome_of_point(data, radar, found, aperture, [(Outcome.NOT_CONVERGED, moving)])

@@ -67,10 +67,10 @@ class WalkAmbiguity(Stage):
 
         Returns:
             `ambiguity` of shape (...,). `info` holds `line`, the index of the range line of the
-            point, and `contrast`, the energy of this line minus that of the strongest line with the
-            next best number, in standard deviations of the energy of a line of noise. Outcomes:
-            `NOISE` unless the contrast is above 5. `OK` says that a line stays bright, whatever its
-            phases.
+            point, and `contrast`. The contrast is the energy of this line minus that of the
+            strongest line with the next best number, in standard deviations of the energy of a line
+            of noise. Outcomes: `NOISE` unless the contrast is above 5. `OK` says that a line stays
+            bright, whatever its phases.
         """
         reference = PointMotion.of(self.radar, signal.data, u_r_m_s, u_a_m_s, y0_m, self.range_m)
         frame, migration = Frame.of(self.radar, signal), Keystone(whole_swath=False)
@@ -80,7 +80,8 @@ class WalkAmbiguity(Stage):
         strongest, line = energies.max(-1)
         number, margin = best_of(-strongest, numbers[(...,) + (None,) * (strongest.ndim - 1)].expand(strongest.shape))
         line = line.gather(0, (number + self.most).long()[None])[0]
-        # the energies of lines with noise alone, by their median absolute deviation
+        # standard deviation of the energies of lines with noise alone, from their median absolute
+        # deviation
         middle = energies[self.most].median(-1, keepdim=True).values
         spread = 1.4826 * (energies[self.most] - middle).abs().median(-1).values
         contrast = margin / spread.clamp_min(1e-12 * middle[..., 0]).clamp_min(TINY)
@@ -139,7 +140,8 @@ class MigratingLines(Stage):
             return self.estimator(signal)
         walk = self.walk(signal)
         first = self._estimate(self.correct(signal, ambiguity=walk["ambiguity"]))
-        # values that are not ok count as well: the migration that they correct may be why
+        # values whose outcome is not ok are used as well, because the migration that they correct
+        # may be the reason
         found = self._estimate(self.correct(signal, **{name: first[name] for name in self.provides}))
         return replace(
             found,

@@ -8,10 +8,8 @@ where there are several.
 
 The phase ramp delays one channel against another by a fraction of a pulse interval, circularly. At
 the ends of a record, the clutter of the channels is therefore not related by it. A taper over a few
-pulses at either end removes this part, which in clutter of 30 dB dominates what whitening leaves.
-
-Reference:
-    Reed, Mallett and Brennan 1974 (sample covariance).
+pulses at either end removes this part, which in clutter of 30 dB dominates the residual after
+whitening. Reference: Reed, Mallett and Brennan 1974 (sample covariance).
 """
 
 from __future__ import annotations
@@ -77,7 +75,7 @@ class Whitening:
 
 
 def _taper(data: Tensor, length: int = 16) -> Tensor:
-    """Return weights of pulses (..., pulse) that rise from 0 to 1 at either end, (pulse,).
+    """Return weights (pulse,) of pulses (..., pulse) that rise from 0 to 1 at either end.
 
     The taper takes at most an eighth of the record. With 900 pulses and clutter of 30 dB, errors of
     0.25 m/s become 0.17 m/s with 9 pulses, and 0.16 m/s with 27 to 108.
@@ -158,7 +156,7 @@ def line_whitening(lines: Tensor, radar: BistaticRadar, samples: int = 60) -> Wh
     rest = PointMotion.of(radar, lines)
     ramp = torch.roll(
         shared_response(radar, rest, n, 2, torch.complex128), -n, -1
-    )  # bin i of an FFT is bin i - n of two bands
+    )  # bin i of an FFT is bin i - n in two bands
     flat = _spectrum(lines.to(torch.complex128)) * ramp.conj()
     products = flat[..., :, None, :] * flat.conj()[..., None, :, :]
     total = products.new_zeros(*products.shape[:-1], (n - 1) * groups // n + 1).index_add(-1, group, products).sum(-4)
@@ -168,12 +166,12 @@ def line_whitening(lines: Tensor, radar: BistaticRadar, samples: int = 60) -> Wh
     level = covariance.diagonal(dim1=-2, dim2=-1).real.mean(-1)
     power = (level * size).sum(-1) / size.sum()
     power = torch.where(power > 0, power, 1.0)
-    # the diagonal keeps the covariance of noise-free data invertible
+    # the diagonal term keeps the covariance of noise-free data invertible
     loaded = covariance + 1e-6 * power[..., None, None, None] * eye
     log_det = (torch.linalg.slogdet(loaded)[1] * size).sum(-1)
     white = channels * torch.log(power) * size.sum()
     # Clutter is assumed from twice the log-likelihood expected by chance. Found by trial: white
-    # noise of 384 pulses is taken for clutter in 0 of 200 trials, with 1.5 times in 2 %.
+    # noise of 384 pulses counted as clutter in 0 of 200 trials, and with 1.5 times in 2 %.
     chance = 2.0 * channels**2 * len(size) / 2
     plain = (white - log_det < chance) | ~(level.amax(-1) > 0)
     covariance = torch.where(plain[..., None, None, None], power[..., None, None, None] * eye, loaded)
