@@ -19,8 +19,8 @@ from torchsar.radar.antenna_path import AntennaPath, broadcast, refuse_unusable
 from torchsar.radar.spotlight import frequency_step_hz
 from torchsar.radar.stripmap import LIGHT_M_S
 
-# Path in metres less the reference path, and weight (None for 1) of some pulses at some pixels,
-# float64 (..., pulse, pixel).
+# function that returns, for some pulses at some pixels, the path in metres less the reference path,
+# and the weight (None for 1), float64 (..., pulse, pixel)
 PathOf = Callable[[slice, slice], tuple[Tensor, Tensor | None]]
 
 _PIXELS = 4096  # pixels of a block, found by trial
@@ -47,9 +47,9 @@ def direct_sum(
     Args:
         history: Phase history s, shape (..., pulse, frequency), complex.
         frequency_hz: Frequencies f in Hz, rising in equal steps, float64 (frequency,).
-        path: Function of a slice of pulses and one of pixels that returns the path l in metres less
-            the path to which the phases refer, and the weight w or None for 1, float64 (..., pulse,
-            pixel).
+        path: Function of a slice of pulses and one of pixels that returns two tensors, float64
+            (..., pulse, pixel). The first is the path l in metres less the path to which the phases
+            refer, the second the weight w, or None for 1.
         pixels: Number of pixels.
         eps: Relative error of the interpolation.
         wave_speed_m_s: Propagation speed c in m/s.
@@ -63,7 +63,7 @@ def direct_sum(
     step = frequency_step_hz(frequency_hz) / wave_speed_m_s * plan.length
     carrier = float(frequency_hz[n // 2]) / wave_speed_m_s
     blocks = list(_slices(pixels, min(pixels, _PIXELS)))
-    # each of the about 20 working arrays of a block takes up to 16 bytes per pulse and pixel
+    # each of about 20 working arrays of a block takes up to 16 bytes per pulse and pixel
     height = max(1, min(pulses, block_bytes // (16 * max(1, trials) * max(blocks[0].stop, 2 * n))))
     sums: list[Tensor | int] = [0] * len(blocks)
     for some in _slices(pulses, height):

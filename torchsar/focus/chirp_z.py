@@ -60,7 +60,7 @@ def chirp_z(
     j = torch.arange(m, dtype=torch.float64, device=x.device) - centre
     i = torch.arange(n, dtype=torch.float64, device=x.device)
     chirped = x * unit_phasor(-start[..., None] * j - step[..., None] * j.square() / 2, x.dtype)
-    # i j = (i^2 + j^2 - (i - j)^2) / 2
+    # the product of the convolution is i j = (i^2 + j^2 - (i - j)^2) / 2
     lag = torch.arange(m + n - 1, dtype=torch.float64, device=x.device) - j[-1]
     length = smooth_length(m + n - 1)
     response = torch.fft.fft(unit_phasor(step[..., None] * lag.square() / 2, x.dtype), length)
@@ -120,7 +120,7 @@ def keystone(data: Tensor, frequency_hz: Tensor, carrier_hz: float, ambiguity: T
             f"{float(frequency_hz.min()):g} Hz with a carrier of {carrier_hz:g} Hz"
         )
     scale = carrier_hz / (carrier_hz + frequency_hz)
-    # the sum over Doppler bins d, sample i at (i - n // 2) scale
+    # sum over the Doppler bins d, with sample i at the time (i - n // 2) scale
     doppler = centred_fft(data.mT) / n
     rows = chirp_z(doppler, scale * (n // 2) / n, -scale / n, n)
     turns = (scale * per_trial(ambiguity, 1, data))[..., None]

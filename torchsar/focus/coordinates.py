@@ -56,8 +56,8 @@ def closest_range(
         per_trial(frame_hz, 2, image), per_trial(radar.velocity_m_s if velocity_m_s is None else velocity_m_s, 2, image)
     )
     cosine = torch.sqrt(1 - sin.square())
-    # column k is r = near + k dr, at the slant range r / cos; 1 / cos - 1 is formed without a
-    # difference of nearly equal numbers
+    # Column k is at the closest range r = near + k dr, and thus at the slant range r / cos. The
+    # value of 1 / cos - 1 is formed without a difference of nearly equal numbers.
     excess = sin.square() / (cosine * (1 + cosine))
     column = torch.arange(n, dtype=torch.float64, device=image.device)
     source = column + (radar.near_range_m / radar.range_step_m + column) * excess

@@ -151,7 +151,7 @@ def quicklook_looks(shape: tuple[int, ...], step_m: tuple[float, float], size: i
 
 
 def _looked(axis: Axis, looks: int) -> Axis:
-    """Axis of block means, with samples at the middles of the blocks."""
+    """Axis of block means, with each sample in the middle of its block."""
     return Axis(axis.name, axis.n // looks, axis.start + (looks - 1) / 2 * axis.step, axis.step * looks, axis.unit)
 
 

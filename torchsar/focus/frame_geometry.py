@@ -49,11 +49,11 @@ def wavenumber(
     cos = torch.sqrt(1 - sin.square())
     root = torch.sqrt(((f0 + frequency_hz - x) * (f0 + frequency_hz + x)).clamp_min(0))
     at_frame = f0 * cos
-    # cos * root + sin * x - f0, with f0 split into f0 (cos^2 + sin^2)
+    # cos * root + sin * x - f0, where f0 is split into f0 (cos^2 + sin^2)
     return cos * (root - at_frame) + sin * (x - f0 * sin)
 
 
-# chosen: width of the raised-cosine edges relative to the processed band
+# width of the raised-cosine edges relative to the processed band, by choice
 BAND_EDGE = 0.1
 
 
@@ -152,9 +152,9 @@ class FrameGeometry:
 
         Raises:
             ValueError: If `doppler_hz` or `velocity_m_s` is neither a number nor a tensor in the
-                shape of the leading dims of the data, the velocity is not positive, the magnitude
-                of `doppler_hz` or `frame_hz` is not below 2 velocity / wavelength, or `band_hz` is
-                not positive.
+                shape of the leading dims of the data. Also if the velocity is not positive, the
+                magnitude of `doppler_hz` or `frame_hz` is not below 2 velocity / wavelength, or
+                `band_hz` is not positive.
         """
         with untraced(doppler_hz, velocity_m_s, frame_hz):
             device = raw.device if device is None else device
@@ -203,8 +203,8 @@ class FrameGeometry:
 
     @property
     def sin_reach(self) -> float:
-        """Largest magnitude of the sine of the squint over all rows, at the carrier frequency; 0
-        where values cannot be read.
+        """Largest magnitude of the sine of the squint over all rows, at the carrier frequency. It
+        is 0 where values cannot be read.
         """
         with untraced(self.doppler_hz, self.velocity_m_s):
             sine = self.radar.sin_squint(self.doppler_hz.detach(), self.velocity_m_s.detach()[..., None])

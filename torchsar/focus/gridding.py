@@ -40,7 +40,7 @@ class LinearMap(torch.autograd.Function):
     """A linear map of a tensor, given as two functions: the map, and its adjoint for gradients.
 
     Both take and return tensors with one leading dimension of trials. Differentiable any number of
-    times; what the functions hold is constant.
+    times; the tensors that the functions refer to are constants.
     """
 
     @staticmethod
@@ -86,8 +86,10 @@ def trilinear(wanted: str, size: int, first: Tensor, a: Tensor, b: Tensor) -> Te
 
 
 class _Trilinear(torch.autograd.Function):
-    """One partial derivative of the trilinear form; a and b are the other two factors in the order
-    of _PARTS, `size` is the number of taps or grid rows of the result.
+    """One partial derivative of the trilinear form.
+
+    a and b are the other two factors in the order of _PARTS; `size` is the number of taps or grid
+    rows of the result.
     """
 
     @staticmethod
@@ -133,19 +135,19 @@ class _Trilinear(torch.autograd.Function):
 
 
 def _in_front(x: Tensor, dim: int | None, count: int) -> Tensor:
-    """The mapped dim joined with the trials."""
+    """Join the dimension that vmap maps over with the trials."""
     x = x.expand(count, *x.shape) if dim is None else x.movedim(dim, 0)
     return x.flatten(0, 1)
 
 
 def _rows(first: Tensor, taps: int, length: int) -> Tensor:
-    """Grid row of each tap, trials one after another, (b * m, tap)."""
+    """Grid row of each tap, (b * m, tap); the rows of the trials follow each other."""
     trial = length * torch.arange(first.shape[0], device=first.device)
     return (first + trial[:, None]).reshape(-1, 1) + torch.arange(taps, device=first.device)
 
 
 def _interpolate(weights: Tensor, grid: Tensor, first: Tensor) -> Tensor:
-    """Weighted sum of grid rows per point."""
+    """Weighted sum of grid rows for each point."""
     rows = _rows(first, weights.shape[-1], grid.shape[-2])
     return embedding_bag(rows, grid.flatten(0, 1), mode="sum", per_sample_weights=weights.flatten(0, 1)).unflatten(
         0, first.shape
@@ -153,8 +155,9 @@ def _interpolate(weights: Tensor, grid: Tensor, first: Tensor) -> Tensor:
 
 
 def _correlate(values: Tensor, grid: Tensor, first: Tensor, taps: int) -> Tensor:
-    """Derivative of the bags by their weights as one torch operation; gathering all taps of all
-    rows first takes four times as long.
+    """Derivative of the weighted sums by their weights, as one torch operation.
+
+    Gathering all taps of all rows first takes four times as long.
     """
     count = first.numel()
     starts = torch.arange(0, count * taps, taps, device=first.device)
@@ -167,12 +170,12 @@ def _correlate(values: Tensor, grid: Tensor, first: Tensor, taps: int) -> Tensor
 
 
 def _spread(weights: Tensor, values: Tensor, first: Tensor, length: int) -> Tensor:
-    """Weighted sum of values per grid row; the entries of a row are contiguous in `source`, from
-    `starts` on.
+    """Weighted sum of values for each grid row. The entries of a row are contiguous in `source`,
+    beginning at `starts`.
     """
     b, m, taps = weights.shape
     rank, start = _ranks(first), _rows(first, 1, length).flatten()
-    # how many points start at or before a row
+    # number of points that start at or before a row
     below = _numbers_of(start, b * length).cumsum(0)
     before = torch.cat([below.new_zeros(taps), below[:-taps]])
     entries = below - before
@@ -188,17 +191,18 @@ def _spread(weights: Tensor, values: Tensor, first: Tensor, length: int) -> Tens
 
 
 def _numbers_of(values: Tensor, length: int) -> Tensor:
-    """How often each of the numbers 0 to length - 1 occurs, (length,) int64."""
+    """Number of times that each of the numbers 0 to length - 1 occurs, (length,) int64."""
     if values.device.type == "cpu" and not is_traced(values):
         return torch.bincount(values, minlength=length)
-    # the length of `bincount` depends on the largest value, for which it waits on other devices
+    # the length of the result of `bincount` depends on the largest value, for which other devices
+    # would have to be awaited
     return torch.zeros(length, dtype=torch.int64, device=values.device).index_add_(0, values, torch.ones_like(values))
 
 
 def _ranks(first: Tensor) -> Tensor:
     """Position of each point in the order of trial and grid row, (b * m,)."""
     every = torch.arange(first.numel(), device=first.device)
-    # on other devices, sorting costs less than waiting for a value
+    # on other devices, sorting takes less time than waiting for a value
     if first.device.type == "cpu" and not host_value((first.diff(dim=-1) < 0).any(), True):
         return every
     order = first.argsort(dim=-1, stable=True)
@@ -246,9 +250,9 @@ class PulseNufft:
         self.lines, self.kernel, self.dtype = lines, kernel, dtype
         self.length = kernel.grid_length(lines)
         line = torch.arange(lines, dtype=torch.float64, device=device) - lines // 2
-        # the taps start at the row of their point instead of half a width before it, so that a
-        # point on a row has its taps about the middle of the kernel for any width; the factor
-        # corrects the shift
+        # The taps start at the row of their point instead of half a width before it. A point on a
+        # row then has its taps about the middle of the kernel for any width. The factor corrects
+        # the shift.
         late = (kernel.taps - 1) / 2 / self.length
         self._factor = torch.polar(scale / kernel.spectrum(line / self.length), -2 * math.pi * late * line).to(dtype)
 
@@ -273,8 +277,8 @@ class PulseNufft:
         position = (cycles_per_line - whole) * self.length
         first = torch.nan_to_num(torch.round(position.detach()), 0.0, 0.0, 0.0)
         weights = self.kernel.weights((position - first).to(real_dtype(self.dtype)))
-        # rows beyond the last tap are not processed; all are inside vmap, where values cannot be
-        # read, and on an accelerator, where waiting for them takes longer
+        # Rows beyond the last tap are not processed. All rows are processed inside vmap, where
+        # values cannot be read, and on an accelerator, where waiting for values takes longer.
         last = self.length + 1
         last = host_largest(first, last) if first.device.type == "cpu" else last
         return PulsePoints(first.to(torch.int64), weights.movedim(0, -1), last + self.kernel.taps)
@@ -316,11 +320,13 @@ class PulseNufft:
         rows = trilinear("values", 0, first, weights, torch.view_as_real(grid).flatten(-2)).unflatten(-1, (-1, 2))
         return torch.view_as_complex(rows).view(*trials, *rows.shape[-3:-1])
 
-    # the two transforms work on blocks of columns that fit the cache and are contiguous while they
-    # are transformed; lines have a strided range dimension
+    # The two transforms work on blocks of columns that fit into the cache and are contiguous while
+    # they are transformed. Lines have a strided range dimension.
 
     def _to_lines(self, grid: Tensor) -> Tensor:
-        """Inverse FFT of grid rows (b, row, range), cropped to the lines, times the factor."""
+        """Inverse FFT of grid rows (b, row, range), cropped to the image lines and multiplied by
+        the factor.
+        """
         b, rows, columns = grid.shape
         length, lines, half, inside = self.length, self.lines, self.lines // 2, min(rows, self.length)
         out = grid.new_empty(b, columns, lines)
@@ -330,7 +336,7 @@ class PulseNufft:
             padded = grid.new_empty(*block.shape[:2], length)
             padded[..., :inside] = block[..., :inside]
             padded[..., inside:] = 0
-            padded[..., : rows - inside] += block[..., inside:]  # periodic
+            padded[..., : rows - inside] += block[..., inside:]  # the grid is periodic
             whole = torch.fft.ifft(padded, norm="forward")
             torch.mul(whole[..., length - half :], self._factor[:half], out=target[..., :half])
             torch.mul(whole[..., : lines - half], self._factor[half:], out=target[..., half:])
@@ -339,7 +345,7 @@ class PulseNufft:
         return out.mT
 
     def _to_grid(self, rows: int, x: Tensor) -> Tensor:
-        """Adjoint of `_to_lines` onto some grid rows, (b, line, range) to (b, row, range)."""
+        """Adjoint of `_to_lines`, from (b, line, range) to some grid rows (b, row, range)."""
         b, lines, columns = x.shape
         length, half, inside = self.length, lines // 2, min(rows, self.length)
         conj, out = self._factor.conj().resolve_conj(), x.new_empty(b, rows, columns)
@@ -359,13 +365,13 @@ class PulseNufft:
 
 
 def _joined(x: Tensor, trials: tuple[int, ...], trailing: int) -> Tensor:
-    """x for all trials, with one leading dim."""
+    """Expand x to all trials, with one leading dimension."""
     return x.expand(*trials, *x.shape[x.ndim - trailing :]).reshape(-1, *x.shape[x.ndim - trailing :])
 
 
 def _blocks(x: Tensor, length: int) -> list[tuple[slice, slice]]:
-    """Parts (trial, column) of x (b, n, column) whose transforms fit the cache: several trials, or
-    columns of one trial.
+    """Parts (trial, column) of x (b, n, column) whose transforms fit into the cache: several
+    trials, or columns of one trial.
     """
     b, _, columns = x.shape
     room = max(8, 4 * block_bytes_of(x.device) // (length * x.element_size()))

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from torchsar.radar.antenna_path import refuse_unusable
 
-# largest accepted difference of the products of the axes from 1 and 0, by choice: axes computed in
-# single precision pass
+# largest accepted difference of the inner products of the axes from 1 and 0, by choice; axes
+# computed in single precision are accepted
 _UNIT = 1e-6
-# most pixels of an image, by choice: 17 GB in single precision
+# largest number of pixels of an image, by choice: 17 GB in single precision
 _MOST_PIXELS = 2**31
 
 
@@ -128,7 +128,7 @@ class ImageGrid:
 
     @property
     def normal(self) -> Tensor:
-        """Direction in which heights grow, float64 (3,)."""
+        """Unit vector along which heights are positive, float64 (3,)."""
         return torch.linalg.cross(*self.axes)
 
     def transposed(self) -> ImageGrid:

@@ -94,15 +94,17 @@ def inverse_requirements(
     aperture_s = n_pulse * period_s
 
     def shift(effect: str, neglects: str, rms_cells: float, cells: float, remedy: str) -> Requirement:
-        """Row of a shift that changes from pulse to pulse, compared by its rms; a cell is a phase
-        of pi at the ends of the band. On an aircraft scene, shifts of 0.05 cell rms cost 0.05 nat
-        of entropy, those of 0.1 cell 0.19 nat.
+        """Row of a range shift that changes from pulse to pulse, compared by its rms.
+
+        A shift by a cell is a phase of pi at the ends of the band. On an aircraft scene, shifts of
+        0.05 cell rms raise the entropy by 0.05 nat, those of 0.1 cell by 0.19 nat.
         """
         return Requirement(effect, neglects, math.pi * rms_cells, cells, math.pi * 0.05, remedy)
 
-    # over the aperture: range migration and the nonlinear phase of rotation. The rms about the mean
-    # of a value that grows linearly by x is x / sqrt(12). On the same scene, a migration of 0.38
-    # cell costs 0.02 nat, one of 0.75 cell 0.07 nat, one of 1.5 cells 0.2 nat
+    # Effects over the aperture: range migration, and the nonlinear phase of rotation. The rms about
+    # the mean of a value that grows linearly by x is x / sqrt(12). On the same scene, a migration
+    # of 0.38 cell raises the entropy by 0.02 nat, one of 0.75 cell by 0.07 nat, and one of 1.5
+    # cells by 0.2 nat.
     angle, linear = abs(omega) * aperture_s, 1 / math.sqrt(12)
     walk, travel = cross_m * angle / cell_m, speed * aperture_s * linear / cell_m
     versed = per_m * range_m * (angle / 2) ** 2 / 2
@@ -110,7 +112,7 @@ def inverse_requirements(
     where = "" if walk > 1 else "warning: the edges blur, up to 0.1 nat of entropy; "
     keystone = f"{where}{resample}{'' if walk > 1 else ' where that matters'}"
     smooth = "align envelopes pulse by pulse and smooth the shifts"
-    # between neighbouring pulses and range frequencies, beyond pi steps alias
+    # phase steps between neighbouring pulses and range frequencies, which alias beyond pi
     swing = sum(2 * abs(a) * math.sin(math.pi * min(f * period_s, 0.5)) for a, f in vibrations)
     turned, extent = per_m * cross_m * abs(omega) * period_s, 2 * range_m / cell_m
     aliased = "the edges of the target are aliased"
@@ -165,13 +167,14 @@ def inverse_requirements(
     )
     if radar.pulse_s is None:
         return rows
-    # motion within a dechirped pulse; a velocity moves a range by `coupling` cells per m/s
+    # effects of motion within a dechirped pulse; a velocity moves a range by `coupling` cells per
+    # m/s
     chirp, half2 = radar.chirp_rate_hz_s, radar.pulse_s**2 / 4
     coupling = radar.carrier_hz / chirp / cell_m
     drift = push * aperture_s * linear * coupling
     shaken = sum(abs(a) * 2 * math.pi * f for a, f in vibrations) * coupling
     inside = push + sum(abs(a) * (2 * math.pi * f) ** 2 for a, f in vibrations)
-    blur = 2 * math.pi * chirp * 2 * half2 / radar.wave_speed_m_s  # rad per m/s
+    blur = 2 * math.pi * chirp * 2 * half2 / radar.wave_speed_m_s  # in rad per m/s
     video = math.pi * chirp * (2 * range_m / radar.wave_speed_m_s) ** 2
     return (
         *rows,

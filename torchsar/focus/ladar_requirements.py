@@ -175,7 +175,7 @@ def ladar_limits(
     drift = 2 * math.pi / per_hz * std * radar.pulse_step_s * math.sqrt(n_period / 15)
     return (
         *rows,
-        # measured: cycle slips in 1 of 1000 pulses at 13 dB, none at 14 dB
+        # measured: cycle slips in 1 of 1000 pulses at 13 dB, and none at 14 dB
         Limit(
             "SNR after compression",
             snr_db + 10 * math.log10(radar.sweep_samples),
@@ -199,7 +199,9 @@ def ladar_limits(
 
 
 def _segmented_std_m_s(radar: TriangularLadar, snr_db: float) -> float:
-    """Standard deviation of one segmented velocity (metrics.velocity_segmented_bound_m_s)."""
+    """Standard deviation in m/s of one segmented velocity
+    (metrics.velocity_segmented_bound_m_s).
+    """
     energy = radar.sweep_samples * 10 ** (snr_db / 10)
     return radar.wavelength_m / 2 * math.sqrt(4 / energy) / (2 * math.pi * radar.sweep_s)
 
@@ -259,8 +261,8 @@ def ladar_requirements(
     video = 2 * math.pi * radar.chirp_rate_hz_s * ((2 * farthest / c) ** 2 - (2 * closest / c) ** 2)
     late = acceleration_m_s2 * radar.reference_range_m / c
     band = 2 * math.pi * radar.bandwidth_hz * travel / c
-    # fourth order of the range history, pi X^4 / (2 lambda R^3), at the end X of the aperture in
-    # the beam, or of the record where that is shorter
+    # Fourth-order term of the range history, pi X^4 / (2 lambda R^3), at the end X of the aperture
+    # in the beam, or of the record if that is shorter.
     reach = radar.speed_m_s * record_s / 2
     if radar.beam_rad is not None:
         reach = min(reach, radar.reference_range_m * radar.beam_rad / 2)

@@ -49,7 +49,7 @@ from torchsar.focus.warped_sums import PulsesToLines, Sum, normalised_warp, slow
 from torchsar.radar import InverseRadar
 from torchsar.radar.warp import least_rate, warp, warp_rate
 
-# chosen limit: shorter records are rejected as invalid input
+# shorter records are rejected as invalid input, by choice
 MIN_PULSES = 8
 # defaults of the transform: the whole pulse rate at two lines per Doppler cell, by gridding
 _DOPPLER_LINES, _GRIDDING = DopplerLines(), Gridding()
@@ -102,7 +102,7 @@ def range_phase(
     data = checked_samples(data, "range_phase", "pulse, range", finite=False)
     n_pulse, n_range = data.shape[-2:]
     phi = warp(slow_times(n_pulse, prf_hz, data.device), k.to(torch.float64))
-    # turns per metre of range
+    # cycles per metre of range
     slope = -(per_trial(omega_rad_s, 1, data) * phi).square() / wavelength_m
     ends = range_m[:2].to(torch.float64)
     start, step = ends[0], ends[1] - ends[0] if n_range > 1 else torch.ones_like(ends[0])
@@ -399,7 +399,7 @@ class MatchedFourier(Stage):
     ) -> None:
         super().__init__()
         _check_weight(weight)
-        DopplerLines(oversampling, lines)  # checks both
+        DopplerLines(oversampling, lines)  # the constructor checks both values
         self.radar, self.oversampling, self.lines, self.cross_range_m = radar, oversampling, lines, cross_range_m
         if cross_range_m is not None:
             step_m, count = cross_range_m
@@ -460,7 +460,7 @@ class MatchedFourier(Stage):
         )
 
     def _lines(self, k: Tensor, pulse: Axis, omega_rad_s: Tensor | None) -> DopplerLines | CrossRangeLines:
-        """Image lines; those in metres are checked against the pulse rate."""
+        """Image lines. Those in metres are checked against the pulse rate."""
         if self.cross_range_m is None:
             return DopplerLines(self.oversampling, self.lines)
         if omega_rad_s is None:
@@ -483,7 +483,7 @@ class MatchedFourier(Stage):
 
 
 def _hold_given(stage: Stage, **values: Tensor | float | None) -> None:
-    """Hold constants of a stage as buffers or parameters, None where there is no value."""
+    """Store constants of a stage as buffers or parameters, and None where there is no value."""
     for name, value in values.items():
         if value is None:
             setattr(stage, name, None)
@@ -492,8 +492,10 @@ def _hold_given(stage: Stage, **values: Tensor | float | None) -> None:
 
 
 def _warp_of(signal: Signal, k: Tensor | None) -> Tensor:
-    """k on the device of the signal, empty where there is none; raises ValueError where its
-    shape does not fit or the rotation angle does not increase throughout the aperture.
+    """Derivatives k of the warp on the device of the signal, empty if there are none.
+
+    Raises ValueError where the shape of k does not fit or the rotation angle does not increase
+    throughout the aperture.
     """
     if k is None:
         return torch.zeros(0, dtype=torch.float64, device=signal.data.device)
@@ -514,7 +516,7 @@ def _warp_of(signal: Signal, k: Tensor | None) -> Tensor:
 
 
 def _broadcasts(a: torch.Size, b: torch.Size) -> bool:
-    """Whether two shapes broadcast."""
+    """True if two shapes broadcast."""
     return all(m == n or 1 in (m, n) for m, n in zip(reversed(a), reversed(b)))
 
 

@@ -72,8 +72,8 @@ from torchsar.radar import (
 from torchsar.radar.antenna_path import refuse_unusable
 from torchsar.radar.spotlight import frequency_step_hz
 
-# zero samples that are appended to the frequencies on each side, into which the spectrum of moved
-# envelopes may spread, by choice
+# number of zeros that are appended to the frequencies on each side, into which the spectrum of
+# moved envelopes may spread, by choice
 _MARGIN = 16
 # relative errors of interpolations by dtype, by choice
 _EPS = {torch.complex64: 1e-5, torch.complex128: 1e-11}
@@ -129,7 +129,7 @@ class MotionCompensation:
         self.frequency_hz, self.antennas, self.grid, self.beam, self.order = frequency_hz, antennas, grid, beam, order
         self.carrier_hz, self.sampling_hz = float(frequency_hz[n // 2]), n * step_hz
         self.track = StraightTrack.fitted(antennas.transmitter_m)
-        # pulses have to sample the processed beam at each frequency
+        # the pulses must sample the processed beam at each frequency
         spread = self.sampling_hz / self.carrier_hz
         band = beam.band * (1 + BAND_EDGE) * (1 + spread / 2) + abs(beam.middle) * spread
         needed, held = 2 * self.carrier_hz / LIGHT_M_S * band, 1 / self.track.step_m
@@ -141,24 +141,24 @@ class MotionCompensation:
             )
         sine, share = beam.quadrature()
         self._cosine = float((share * torch.sqrt(1 - sine.square())).sum())
-        # largest magnitude of the tangent of an angle with a weight
+        # largest tangent of an angle that has a weight
         steepest = math.tan(math.asin(max(map(abs, beam.ends))))
         self._set_plane(steepest)
-        # the range to which all pulses refer
+        # range to which the phases of all pulses refer
         self.window_m = float(antennas.reference_m.mean()) / 2
         middle = torch.full_like(self._pulse_m, sum(self._closest_m) / 2 / self._cosine)
         self._first_m = self._correction_m(middle[:, None])[:, 0]
         self._set_cells(step_hz, steepest)
         left = self.predicted_db()
-        if left > -6:  # half the amplitude
+        if left > -6:  # -6 dB, half the amplitude
             raise ValueError(
                 f"the path is too far from straight, {float(self._off_m.abs().max()):.3g} m at most: motion "
                 f"compensation would leave an image error of {left:.3g} dB; choose a narrower beam or image it by tiles"
             )
 
     def _set_cells(self, step_hz: float, steepest: float) -> None:
-        """Choose the frequencies of the compensated data, beyond those of the history, and compute
-        the ranges of the cells.
+        """Choose the frequencies of the compensated data, which exceed those of the history, and
+        compute the ranges of the cells.
         """
         n = len(self.frequency_hz)
         window = LIGHT_M_S / (2 * step_hz)
@@ -167,9 +167,9 @@ class MotionCompensation:
                 f"the range window of {window:.4g} m about {self.window_m:.4g} m reaches the antenna; choose larger "
                 "steps of frequency or image it by tiles"
             )
-        # omega-K lowers frequencies by their distance from the middle of the beam, and the second
-        # order moves them by the slope of the correction; zeros make room for them, and for what
-        # frequencies between two samples leak
+        # Omega-K lowers frequencies by their distance from the middle of the beam, and the second
+        # order shifts them by the slope of the correction. Zeros make room for both, and for the
+        # leakage of frequencies between two samples.
         lowered = 1 - math.cos(math.atan(steepest) - math.asin(abs(self.beam.middle)))
         ends = torch.tensor([self._closest_m], dtype=torch.float64, device=self._pulse_m.device)
         change = self._correction_m(ends / self._cosine).diff(dim=-1)
@@ -220,8 +220,8 @@ class MotionCompensation:
         return off_m.square().sum(-1) - 2 * closest_m * toward
 
     def _correction_m(self, range_m: Tensor) -> Tensor:
-        """Range from each pulse minus that from the track that is compensated at a range from the
-        track, float64 (pulse, range).
+        """Range correction in metres: range from each pulse minus that from the track, at ranges
+        from the track, float64 (pulse, range).
         """
         along = self._pulse_m[:, None] + self.beam.middle * range_m
         excess = self._excess(along, self._cosine * range_m, self._off_m[:, None])
@@ -236,10 +236,10 @@ class MotionCompensation:
                 alike.
 
         Returns:
-            Relative square error in dB: the mean of |exp(j phi) - 1|^2 over pulses, angles, closest
-            ranges and frequencies, phi being the phase that motion compensation leaves; plus the
-            change of the Fresnel ripple of the beam's edges over the swath; plus what leaks beyond
-            the band.
+            Relative square error in dB. It is the mean of |exp(j phi) - 1|^2 over pulses, angles,
+            closest ranges and frequencies, where phi is the phase that motion compensation leaves.
+            The change over the swath of the Fresnel ripple of the beam's edges, and the leakage
+            beyond the band, are added.
         """
         device, (low, high) = self._pulse_m.device, self._closest_m
         node, weight = (torch.from_numpy(x).to(device) for x in np.polynomial.legendre.leggauss(9))
@@ -252,7 +252,7 @@ class MotionCompensation:
             for exact in (self._filter(r * (1 + side * spread)) for side in (-1, 1)):
                 ripple[i] += (used - exact).abs().square().sum() / exact.abs().square().sum() / 2
         error = float((weight * (self._phase_error(closest, pattern) + ripple)).sum())
-        # relative error power that spreads beyond the appended zeros, measured for white noise
+        # relative error power of the spread beyond the appended zeros, measured for white noise
         return 10 * math.log10(error + 0.025 / (_MARGIN * len(self.frequency_hz)))
 
     def _phase_error(self, closest_m: Tensor, pattern: Callable[[Tensor], Tensor] | None) -> Tensor:
@@ -260,7 +260,7 @@ class MotionCompensation:
         sine, share = (x.to(closest_m.device) for x in self.beam.quadrature())
         share = share if pattern is None else share * pattern(sine)
         some = slice(None, None, max(1, len(self._pulse_m) // 512))
-        # (pulse, range, angle)
+        # shape (pulse, range, angle)
         range_m = closest_m[:, None] / torch.sqrt(1 - sine.square())
         along = self._pulse_m[some, None, None] + range_m * sine
         low, high = self._along_m
@@ -294,7 +294,7 @@ class MotionCompensation:
         samples = frequency_samples(profiles) * unit_phasor(point * (first + self.lines // 2), dtype)[:, None]
         spectrum = plan.type1(samples, plan.points(point))
         filtered = self._filter(sum(self._closest_m) / 2)
-        # the filter depends on the angle, at each frequency on another line
+        # the filter depends on the angle, which at each frequency belongs to another line
         at = (number[:, None] * (self.carrier_hz / f) - first).clamp(0, self.lines - 1.001)
         below = at.floor().long()
         weight = torch.lerp(filtered[below], filtered[below + 1], (at - below).to(filtered))
@@ -303,8 +303,8 @@ class MotionCompensation:
         return range_profiles(torch.fft.ifft(spectrum, dim=-2))
 
     def _bins(self) -> Tensor:
-        """Numbers of the frequencies along the track in cycles per circular length of all lines,
-        about the middle of the beam, float64 (line,).
+        """Frequency numbers along the track, in cycles per circular length of all lines, around the
+        middle of the beam, float64 (line,).
         """
         middle = 2 * self.carrier_hz / LIGHT_M_S * self.beam.middle * self.lines * self.track.step_m
         number = torch.arange(self.lines, dtype=torch.float64, device=self._pulse_m.device)
@@ -312,10 +312,10 @@ class MotionCompensation:
 
     def _filter(self, closest_m: float) -> Tensor:
         """Spectrum along the track of the weighted sum over pulses for a point at a closest range,
-        relative to that of omega-K, complex128 (line,).
+        complex128 (line,).
 
-        By stationary phase it is the weight at the angle times cos^(-3/2). The exact sum has the
-        Fresnel ripple of the edges of the beam as well.
+        It is relative to that of omega-K. By stationary phase it is the weight at the angle times
+        cos^(-3/2). The exact sum also has the Fresnel ripple of the edges of the beam.
         """
         step, wave, r = self.track.step_m, 2 * self.carrier_hz / LIGHT_M_S, closest_m
         number = torch.arange(self.lines, dtype=torch.float64, device=self._pulse_m.device)
@@ -337,14 +337,14 @@ class MotionCompensation:
         Returns:
             Range profiles, shape (..., line, range), see `even_pulses`.
         """
-        # first order: the middle of the swath has its nominal range, and phases refer to the range
-        # `window_m` at all pulses
+        # First order: the middle of the swath is moved to its nominal range. Phases refer to the
+        # range `window_m` at all pulses.
         moved = 2 * (self._first_m + self.window_m) - self.antennas.reference_m
         history = history * unit_phasor(moved[:, None] * self.frequency_hz / LIGHT_M_S, history.dtype)
         before = self.cells // 2 - history.shape[-1] // 2
         profiles = range_profiles(pad(history, (before, self.cells - history.shape[-1] - before)))
         if self.order == 2:
-            # the phase that the first order leaves in each range cell
+            # phase that the first order leaves in each range cell
             left = self._correction_m(self.range_m[None]) - self._first_m[:, None]
             profiles = profiles * unit_phasor(2 * self.carrier_hz / LIGHT_M_S * left, profiles.dtype)
         return self.even_pulses(profiles)
@@ -370,7 +370,8 @@ class MotionCompensation:
         doppler = 2 * self.carrier_hz / LIGHT_M_S * beam.middle
         sampling = self.sampling_hz * self.cells / len(self.frequency_hz)
         near = self.window_m - self.cells // 2 * LIGHT_M_S / (2 * sampling)
-        # slow time is the coordinate along the track, at 1 m/s; the aperture is that of the beam
+        # slow time is the coordinate along the track at a speed of 1 m/s; the aperture is that of
+        # the beam
         pulse, aperture = LinearFM(self.sampling_hz, 1.0), near * beam.band / (1 - beam.middle**2)
         radar = StripmapRadar(self.carrier_hz, pulse, sampling, 1 / step, 1.0, near, None, aperture)
         eps = 1e-12 if data.dtype == torch.complex128 else 2e-4
@@ -385,7 +386,7 @@ class MotionCompensation:
         eps = _EPS[image.dtype]
         plans = [Nufft(size, eps, image.dtype, image.device) for size in (lines, n)]
         spectrum = torch.fft.fft2(image).roll((lines // 2 - middle, n // 2), (-2, -1)) / (lines * n)
-        grid = plans[0].grid(plans[1].grid(spectrum).mT)  # (..., range, line)
+        grid = plans[0].grid(plans[1].grid(spectrum).mT)  # shape (..., range, line)
         made = []
         for pixels in self.grid.pixels_m().reshape(-1, 3).split(1 << 18):
             closest = torch.linalg.vector_norm(self.track.across_m(pixels), dim=-1)

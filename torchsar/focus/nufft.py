@@ -130,7 +130,7 @@ class Kernel:
         Returns:
             Spectrum, same shape, float64.
         """
-        # sinh(x) / x of a real or imaginary x, scaled as weights() are
+        # sinh(x) / x for real or imaginary x, scaled as in `weights`
         square = self.shape**2 - (math.pi * self.taps * cycles).square()
         root = torch.sqrt(square.abs()).clamp_min(1e-12)
         return (
@@ -143,10 +143,11 @@ class Kernel:
 
 @functools.lru_cache
 def _polynomials(kernel: Kernel, device: torch.device) -> Tensor:
-    """Coefficients of the piece of the kernel at each tap in powers of twice the offset, float64
-    (taps, degree + 1).
+    """Coefficients of the piece of the kernel at each tap, float64 (taps, degree + 1), in powers of
+    twice the offset.
     """
-    degree = kernel.taps  # found by trial: taps - 1 still reaches the kernel's error, taps - 2 does not
+    # found by trial: taps - 1 still reaches the error of the kernel, taps - 2 does not
+    degree = kernel.taps
     u = torch.cos(math.pi * (torch.arange(3 * degree, dtype=torch.float64) + 0.5) / (3 * degree))
     tap = torch.arange(kernel.taps, dtype=torch.float64) - (kernel.taps - 1) / 2
     z = 2 * (tap[:, None] - u / 2) / kernel.taps
@@ -243,7 +244,7 @@ def spread(values: Tensor, points: Points, length: int) -> Tensor:
 
 
 def _flat_index(first: Tensor, width: int) -> Tensor:
-    """Index of the first tap in the flattened grid of all rows."""
+    """Index of the first tap of each point in the flattened grid of all rows."""
     row = torch.arange(math.prod(first.shape[:-1]), device=first.device) * width
     return (first + row.view(*first.shape[:-1], 1)).reshape(-1)
 

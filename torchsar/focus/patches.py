@@ -14,8 +14,8 @@ from torchsar.core import Signal
 from torchsar.focus.strip_backprojection import Backproject
 from torchsar.radar import StripmapRadar
 
-# half of the lines and cells of a patch: it holds the main lobe and a dozen side lobes at any usual
-# sampling
+# Half of the number of lines and of cells of a patch. It then contains the main lobe and a dozen
+# side lobes at any usual sampling.
 HALF = 16
 
 

@@ -26,12 +26,12 @@ from torchsar.radar.antenna_path import AntennaPath
 from torchsar.radar.spotlight import frequency_samples
 from torchsar.radar.stripmap import LIGHT_M_S
 
-# windows over pulses and over frequencies by name, if they differ
+# windows over pulses and over frequencies, by the names of window pairs that differ
 _WINDOWS = {"range": ("none", "hann")}
-# pulses of an aperture at which spatial frequencies are computed, and points of the image along
-# either axis, both by choice
+# numbers of pulses of an aperture at which spatial frequencies are computed, and of points of the
+# image along either axis, both by choice
 _PULSES, _POINTS = 33, 3
-# share of a band that holds 99.9 % of the energy with a Hann window in both directions
+# share of a band that contains 99.9 % of the energy if there are Hann windows in both directions
 _HELD = 0.8
 
 
@@ -151,11 +151,12 @@ class PathImage(Stage):
         return None if self.beam is None else partial(self.beam.pulse_weights, _mean_place(antennas))
 
     def sampling_limits(self, antennas: AntennaPath, frequency_hz: Tensor) -> list[Limit]:
-        """Return the limits of the sample spacing, up to which samples hold the spectrum.
+        """Return the limits of the sample spacing up to which the samples represent the spectrum.
 
-        The limit is the inverse of the spectrum of all of nine points of the image, of which Hann
-        windows in both directions leave 80 % (99.9 % of the energy). An image with coarser samples
-        shows the same brightness, but it cannot be resampled, or compared with a displaced one.
+        The spectrum is that of all of nine points of the image, of which Hann windows in both
+        directions leave 80 % (99.9 % of the energy). The limit is the inverse of its width. An
+        image with coarser samples shows the same brightness, but it cannot be resampled, or
+        compared with a displaced one.
 
         Args:
             antennas: Path of the antennas.
@@ -198,11 +199,11 @@ class PathImage(Stage):
         power: Callable[[Tensor], Tensor] | None = None,
         beam: ProcessedBeam | None = None,
     ) -> list[Limit]:
-        """Return the limit of the distance of pulses, up to which they hold the Doppler band.
+        """Return the limit of the distance of pulses up to which they sample the Doppler band.
 
         Beyond it, a point appears again where its Doppler frequency differs by the PRF. The level
-        of such a ghost is the share of the echo in the pulses within whose beam both lie, less what
-        the range window leaves of it: the range of a ghost changes by a wavelength per pulse.
+        of such a ghost is the share of the echo from those pulses whose beam contains both. The
+        range window lowers it, because the range of a ghost changes by a wavelength per pulse.
 
         Args:
             antennas: Path of the antennas; the receiver has the beam.
@@ -220,7 +221,7 @@ class PathImage(Stage):
         track, ways = StraightTrack.fitted(_mean_place(antennas)), 2 if antennas.receiver_m is None else 1
         wavelength = LIGHT_M_S / float(frequency_hz.max())
         longest = wavelength / (ways * beam.band)
-        # sine by which the lines of sight to a point and to its ghost differ
+        # difference between the sines of the lines of sight to a point and to its ghost
         apart = wavelength / (ways * track.step_m)
         low, high = beam.ends
         sine = torch.linspace(low - apart, high + apart, 4096, dtype=torch.float64)
@@ -330,12 +331,14 @@ def spatial_band(
 
 
 def _hann_response(cells: Tensor) -> Tensor:
-    """Response of a band with a Hann window at distances in cells, relative to its peak."""
+    """Response of a band with a Hann window at distances in resolution cells, relative to
+    its peak.
+    """
     return torch.sinc(cells) + (torch.sinc(cells - 1) + torch.sinc(cells + 1)) / 2
 
 
 def _mean_place(antennas: AntennaPath) -> Tensor:
-    """Mean positions of the receiver of all trials, float64 (pulse, 3)."""
+    """Positions of the receiver, averaged over all trials, float64 (pulse, 3)."""
     return antennas.places[-1].detach().reshape(-1, antennas.pulses, 3).mean(0)
 
 

@@ -48,7 +48,7 @@ class SparseRows:
     def __call__(self, x: Tensor) -> Tensor:
         """Multiply the matrix with complex vectors (trial, columns), giving (trial, rows).
 
-        Real and imaginary parts of all trials are the columns of one product.
+        The real and imaginary parts of all trials are the columns of one product.
         """
         vectors = torch.view_as_real(x.resolve_conj()).movedim(0, 1)
         with warnings.catch_warnings():
@@ -155,7 +155,7 @@ class PolarOperator:
         return self._by_trials(self._image, profiles)
 
     def _image(self, profiles: Tensor) -> Tensor:
-        """The image of one block of trials."""
+        """Image of one block of trials."""
         samples = frequency_samples(profiles) * self._factor
         grid = LinearMap.apply(samples.flatten(-2), *self._spread).unflatten(-1, (self._y.length, self._x.length))
         columns = cropped(torch.fft.ifft(grid, dim=-2, norm="forward"), self._y.n, -2)
@@ -184,14 +184,14 @@ class PolarOperator:
         return self._by_trials(self._adjoint, image)
 
     def _adjoint(self, image: Tensor) -> Tensor:
-        """The adjoint of one block of trials."""
+        """Adjoint of `_image` for one block of trials."""
         columns = torch.fft.fft(embedded(image * self._unkernel, self._x.length))
         grid = torch.fft.fft(embedded(columns, self._y.length, -2), dim=-2)
         samples = LinearMap.apply(grid.flatten(-2), *self._spread[::-1]).unflatten(-1, self._factor.shape)
         return range_profiles(samples * self._factor.conj())
 
     def _by_trials(self, work: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
-        """Apply `work` to blocks of trials whose grids fit the cache."""
+        """Apply `work` to blocks of trials whose grids fit into the cache."""
         count = max(1, 8 * block_bytes_of(x.device) // (self._y.length * self._x.length * x.element_size()))
         flat = x.reshape(-1, *x.shape[-2:])
         out = work(flat) if flat.shape[0] <= count else torch.cat([work(part) for part in flat.split(count)])
@@ -263,12 +263,12 @@ class PolarFormat(GroundImager):
 
 
 def _taps(plan: Nufft, cycles: Tensor) -> tuple[Tensor, Tensor]:
-    """Grid index and weight of all taps of wave numbers in cycles per pixel, (sample, tap)."""
+    """Grid index and weight of all taps, (sample, tap), for wave numbers in cycles per pixel."""
     points = plan.points(cycles)
     tap = torch.arange(plan.kernel.taps, device=cycles.device)
     return (points.first[:, None] + tap) % plan.length, points.weights.T
 
 
 def _same(kept: list[Tensor], now: list[Tensor]) -> bool:
-    """Whether two geometries are equal."""
+    """True if two geometries are equal."""
     return all(a.device == b.device and torch.equal(a, b) for a, b in zip(kept, now))

@@ -1,4 +1,6 @@
-"""Beam whose echoes are processed, with smooth edges, and the pulses that see a point within it."""
+"""Beam whose echoes are processed, with smooth edges, and the pulses that illuminate a point within
+it.
+"""
 
 from __future__ import annotations
 
@@ -102,7 +104,7 @@ class ProcessedBeam:
         pulse, along = track.along_m(position_m), track.along_m(points_m)
         closest = torch.linalg.vector_norm(track.across_m(points_m), dim=-1)
         low, high = (along - closest * math.tan(math.asin(sine)) for sine in reversed(self.ends))
-        # an antenna that turns back may pass a coordinate several times
+        # if the antenna turns back, it may pass a coordinate several times
         first = torch.searchsorted(pulse.cummax(0).values, low)
         last = torch.searchsorted(pulse.flip(0).cummin(0).values.flip(0), high, right=True)
         return torch.stack([first, torch.maximum(first, last)], -1)

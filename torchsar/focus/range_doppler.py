@@ -70,8 +70,8 @@ def range_doppler(
     Raises:
         TypeError: If the samples are not complex64 or complex128.
         ValueError: If there are no samples, or if `doppler_hz` or `velocity_m_s` is neither a
-            number nor a tensor in the shape of the leading dims of the data, the velocity is not
-            positive, the magnitude of `doppler_hz` or `frame_hz` is not below 2 velocity /
+            number nor a tensor in the shape of the leading dims of the data. Also if the velocity
+            is not positive, the magnitude of `doppler_hz` or `frame_hz` is not below 2 velocity /
             wavelength, or `band_hz` is not positive.
     """
     raw = checked_samples(raw, "range_doppler", "pulse, range", finite=False)
@@ -86,8 +86,8 @@ def range_doppler(
     def focus_rows(rows: Tensor, part: slice) -> Tensor:
         at = geometry.rows(part)
         spectrum = rows if reference is None else rows * reference.to(rows.dtype)
-        # cell i of the image lies at cell i + range_cells * migration of the row; the exponent is
-        # +2j pi k q / n, so that points have the opposite sign
+        # Cell i of the image lies at cell i + range_cells * migration of the row. The exponent is
+        # +2j pi k q / n, so that points have the opposite sign.
         start = migration(at) * centre_cells
         shift = start[..., None] + migration(at)[..., None] * (range_cells - centre_cells)
         points = Points.of(plan.kernel, -per_sample * cell, plan.length, real, -per_sample * shift)

@@ -72,7 +72,7 @@ def phase_reference(pulse: LinearFM, n: int, sampling_hz: float, device: torch.d
     return spectrum.conj() / size * (n / size.sum())
 
 
-# range references by the names that stages accept
+# reference functions by the names that stages accept
 REFERENCES = {"matched": matched_reference, "flat": flat_reference, "phase": phase_reference}
 
 

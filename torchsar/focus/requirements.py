@@ -19,7 +19,7 @@ from torchsar.focus.frame_geometry import FrameGeometry, wavenumber
 from torchsar.focus.skew import EXCESS, skew_hz
 from torchsar.radar import StripmapRadar
 
-# the simplification of every form of omega-K and of range-Doppler
+# name of the simplification that every form of omega-K and range-Doppler makes
 EQUAL_WEIGHTS = "equal weights of range frequencies"
 
 
@@ -215,16 +215,17 @@ class Aperture:
 
     @property
     def wrapped(self) -> Tensor:
-        """Where the Doppler lies outside the PRF interval about the centroid at the carrier.
+        """True where the Doppler lies outside the PRF interval about the centroid at the carrier.
+        Shape (d, f), bool.
 
         A focuser that unwraps all range frequencies about this centroid loses these parts of the
-        spectrum. An excess of a twentieth of the PRF is tolerated. Shape (d, f), bool.
+        spectrum. An excess of a twentieth of the PRF is tolerated.
         """
         reach = (1 + EXCESS) * self.at.radar.prf_hz / 2
         return (self.doppler_hz - self.at.doppler_hz.mean()).abs() > reach
 
     def _mapped(self, frequency_hz: Tensor) -> Tensor:
-        """Mapping G - f0 at `doppler_hz` and at frequencies (f,) or (1,), shape (d, f)."""
+        """Mapping G - f0 at `doppler_hz` and at range frequencies (f,) or (1,), shape (d, f)."""
         at = self.at
         return wavenumber(at.radar, frequency_hz[:, None], self.doppler_hz, at.velocity_m_s, at.frame_hz)[..., 0]
 
@@ -319,7 +320,8 @@ def requirements(
     Returns:
         One `Requirement` per simplification: what it neglects, the error and the remedy.
     """
-    middle = axes[-1].start + axes[-1].n // 2 * axes[-1].step  # where bulk processing is exact
+    # range at which bulk processing is exact
+    middle = axes[-1].start + axes[-1].n // 2 * axes[-1].step
     velocity = radar.velocity_m_s if velocity_m_s is None else float(velocity_m_s)
     doppler = (radar.pointing_doppler_hz or 0.0) if doppler_hz is None else float(doppler_hz)
     frame = (
@@ -334,7 +336,7 @@ def requirements(
     )
     near, far = full_swath_m(radar, axes, doppler, velocity, aperture.integration_s)
     half = max(abs(near - middle), abs(far - middle))
-    # a quarter of a turn has the mean square error of the random phase of wrapped parts
+    # a phase of pi / 2 has the mean square error of the random phase of wrapped parts
     bulk_rad, coupling_rad = (
         torch.where(aperture.wrapped, math.pi / 2, phase)
         for phase in (aperture.bulk_residual_rad(half), aperture.coupling_rad(far))
@@ -349,7 +351,7 @@ def requirements(
     inside = math.pi * aperture.doppler_band_hz * radar.pulse.duration_s
     displaced = abs(doppler) / abs(radar.pulse.rate_hz_s) * radar.sampling_hz
     single = 2 * math.pi * back_turns * far * 2.0**-24
-    # mean square over the band of (1 + f / f0)^(-1/2) - 1, about f / (2 f0)
+    # mean square over the band of (1 + f / f0)^(-1/2) - 1, which is about f / (2 f0)
     equal_weights = (radar.pulse.bandwidth_hz / radar.carrier_hz) ** 2 / 48
 
     def row(
@@ -392,8 +394,8 @@ def requirements(
             math.nan,
             "use omega_k" if without_stolt.ok and one_centroid.ok else "use omega_k_stolt",
             coupling_rad,
-            # measured PSLR in range beside that of exact focusing: 0.03 dB higher at 0.6 rad
-            # without squint, 0.10 dB higher at 0.53 rad and 0.8 dB at 1.2 rad with squint
+            # Measured increase of the PSLR in range over exact focusing: 0.03 dB at 0.6 rad without
+            # squint; 0.10 dB at 0.53 rad and 0.8 dB at 1.2 rad with squint.
             0.5,
         ),
         one_centroid,
@@ -485,8 +487,10 @@ def strip_limits(radar: StripmapRadar, samples: int, doppler_hz: float, velocity
 
 
 def _parabola_rad(aperture: Aperture, range_m: float) -> float:
-    """Largest 4 pi / lambda |r - parabola| over the aperture of a target at slant range range_m,
-    with a parabola that touches the range history at the beam centre.
+    """Largest phase 4 pi / lambda |r - parabola| over the aperture of a target at slant range
+    range_m.
+
+    The parabola touches the range history at the beam centre.
     """
     radar, velocity = aperture.at.radar, float(aperture.at.velocity_m_s)
     sin = float(radar.sin_squint(aperture.at.doppler_hz.mean(), velocity))

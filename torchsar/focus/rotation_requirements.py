@@ -18,7 +18,7 @@ from torchsar.focus.requirements import Limit, Requirement, phase_error_db
 from torchsar.radar import InverseRadar
 from torchsar.radar.warp import least_rate, warp, warp_rate
 
-# samples over the aperture at which the warp is evaluated, and orders of it that
+# number of samples over the aperture at which the warp is evaluated, and number of its orders that
 # `rotation_requirements` lists, both by choice
 _POINTS, _ORDERS = 513, 4
 
@@ -74,7 +74,7 @@ def rotation_limits(
     power = amplitude.abs().square()
     cell = radar.wavelength_m / (2 * omega_rad_s * float(warp(time[-1:], warp_k)))
     mean_square = (lever.square() * power).sum() / power.sum().clamp_min(torch.finfo(torch.float64).tiny)
-    # noise alone exceeds 20 times its power with the probability exp(-20), one in 5e8
+    # noise alone exceeds 20 times its mean power with the probability exp(-20), one in 5e8
     above = power * n_pulse > 20 * noise_std**2 if noise_std > 0 else power > 0
     rows = (
         Limit(
@@ -152,8 +152,8 @@ def rotation_limits(
 
 
 def _off_line(x: Tensor, y: Tensor, weight: Tensor) -> float:
-    """Rms share (0..1) of the ranges that no line y = s x through the centre explains; 0 for a
-    single scatterer.
+    """Rms share (0..1) of the ranges that no line y = s x through the centre explains. It is 0 for
+    a single scatterer.
     """
     if int((weight > 0).sum()) < 2:
         return 0.0
@@ -245,7 +245,7 @@ def rotation_requirements(
             "migration through range cells",
             math.pi * walk,
             walk,
-            math.pi * 0.2,  # a migration by which a peak loses 0.2 dB
+            math.pi * 0.2,  # phase of a migration that lowers a peak by 0.2 dB
             "use the fidelity dechirped",
             phase_error_db(migration),
         ),
@@ -325,7 +325,9 @@ def order_loss_db(
 
 
 def _legendre_left(k: Tensor, duration_s: float) -> list[Tensor]:
-    """Sum (s) over the aperture of the Legendre terms of the warp beyond orders 1, 2, 3 and 4."""
+    """Sums over the aperture, in seconds, of the Legendre terms of the warp beyond the orders 1, 2,
+    3 and 4.
+    """
     s = np.linspace(-1, 1, _POINTS)
     values = warp(torch.from_numpy((s + 1) * duration_s / 2), k).numpy()
     degree = max(_ORDERS + 1, k.shape[-1] + 1)

@@ -32,11 +32,12 @@ from torchsar.focus.frame_geometry import BAND_EDGE, FrameGeometry, band_weight,
 from torchsar.focus.omega_k import is_whole, through_doppler
 from torchsar.radar import StripmapRadar
 
-# tolerated excess of the band of an image over its sampling rate, relative to this rate; measured
-# error of the azimuth width of the interpolated image: 0.1 % at 0.07, 0.7 % at 0.14, 8 % at 0.21
+# Tolerated excess of the band of an image over its sampling rate, relative to this rate. The
+# measured error of the azimuth width of the interpolated image was 0.1 % at 0.07, 0.7 % at 0.14 and
+# 8 % at 0.21.
 EXCESS = 0.05
-# chosen: skew relative to the processed band, below which the weights of the band are those of the
-# carrier for all range frequencies; its edges are 0.1 wide
+# Skew relative to the processed band below which all range frequencies have the band weights of the
+# carrier, by choice. The edges of the weights are 0.1 wide.
 _LEAST_SKEW = 1e-3
 
 
@@ -313,7 +314,7 @@ def through_skewed_doppler(
     """
 
     def parts(rows: Tensor, part: slice) -> Iterator[tuple[Tensor, int, list[int] | slice]]:
-        """Focused lines, their change of the number of PRFs, and their rows."""
+        """Generate parts of focused lines, the change of their number of PRFs, and their rows."""
         at = geometry.rows(part)
         rows = skew.weighted(rows, part)
         jumping, changes = skew.jumps(part)
@@ -333,8 +334,8 @@ def through_skewed_doppler(
                 yield focus_rows(some * (change == k).to(mine.dtype), there), k, jumping
 
     def whole(rows: Tensor, part: slice) -> Tensor:
-        """Sum of the parts, shape (..., d, range), or (..., factor, d, range) for several lines per
-        pulse.
+        """Sum of the parts, shape (..., d, range). For several lines per pulse it is (..., factor,
+        d, range).
         """
         total: Tensor | None = None
         for lines, k, which in parts(rows, part):

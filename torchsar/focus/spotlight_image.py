@@ -90,10 +90,10 @@ def scene_grid(
     slope = sum(2 / len(away) * v / torch.linalg.vector_norm(v, dim=-1, keepdim=True) for v in away)
     assert isinstance(slope, Tensor)
     mean = slope.mean(-2)
-    # by choice, directions that cancel to a tenth are all around
+    # if the mean direction is below a fifth, the directions are all around, by choice
     angle = math.atan2(float(mean[1]), float(mean[0])) if float(mean[:2].norm()) > 0.2 else 0.0
     axes = slope.new_tensor([[math.cos(angle), math.sin(angle), 0.0], [-math.sin(angle), math.cos(angle), 0.0]])
-    along = slope @ axes.mT  # per pulse, along range and azimuth
+    along = slope @ axes.mT  # slope per pulse, along range and azimuth
     ends = torch.stack([along * f / LIGHT_M_S for f in (frequency_hz[0], frequency_hz[-1])])
     band = (ends.amax((0, 1)) - ends.amin((0, 1))).tolist()
     if not (band[0] > 0 and float(along[:, 1].amax() - along[:, 1].amin()) > 0):
@@ -103,14 +103,14 @@ def scene_grid(
         )
     steps = slope.diff(dim=0).norm(dim=-1)
     usual = float(steps[steps > 0].median())
-    if float(steps.max()) > 10 * usual:  # by choice, beyond what uneven speed makes
+    if float(steps.max()) > 10 * usual:  # by choice, more than an uneven speed causes
         warnings.warn(
             f"the largest step between pulses, at pulse {int(steps.argmax())}, is {float(steps.max()) / usual:.3g} "
             "times the median one: pulses are missing there, which raises side lobes in azimuth",
             stacklevel=3,
         )
     clear = (2 * window_m / float(along[:, 0].abs().max()), LIGHT_M_S / (float(frequency_hz[-1]) * usual))
-    if near and float(centre.norm()) > 0:  # what is unambiguous grows with the range
+    if near and float(centre.norm()) > 0:  # the unambiguous extent grows with the range
         farther = 1 + extent[0] / 2 / float((centre - torch.stack(antennas.places).mean((0, 1))).norm())
         clear = (clear[0], clear[1] * farther)
     step = 1 / (_OVERSAMPLING * max(band))
@@ -131,8 +131,10 @@ def scene_grid(
 
 
 def _points_at_origin(antennas: AntennaPath, window_m: float) -> bool:
-    """Whether the reference paths follow the path over the origin: they differ by less than a
-    quarter of it, by choice, where the range window is far from the radar.
+    """True if the reference paths follow the path over the origin.
+
+    They then differ by less than a quarter of it, by choice, and the range window is far from the
+    radar or the path is closed.
     """
     over = antennas.path_m(antennas.transmitter_m.new_zeros(1, 3))[:, 0]
     whole = over + antennas.reference_m
@@ -141,16 +143,18 @@ def _points_at_origin(antennas: AntennaPath, window_m: float) -> bool:
 
 
 def _closed(antennas: AntennaPath) -> bool:
-    """Whether a path comes back, so that its end is nearer to its start than half of its length
-    over pi, by choice.
+    """True if a path returns: its end is nearer to its start than half of its length over pi, by
+    choice.
     """
     place = torch.stack(antennas.places).mean(0)[:, :2]
     return float((place[-1] - place[0]).norm()) < float(place.diff(dim=0).norm(dim=-1).sum()) / (2 * math.pi)
 
 
 def _abeam(antennas: AntennaPath, window_m: float, warn: bool) -> tuple[Tensor, tuple[float, float]]:
-    """The middle of the scene of a radar that does not point at the origin, and its extents in
-    range and azimuth in metres. A warning says which side was chosen, if `warn`.
+    """Middle of the scene of a radar that does not point at the origin, and extents of the scene in
+    range and azimuth in metres.
+
+    If `warn`, a warning names the side that was chosen.
     """
     place = torch.stack(antennas.places).mean(0)
     middle = (place.amax(0) + place.amin(0)) / 2
@@ -162,7 +166,7 @@ def _abeam(antennas: AntennaPath, window_m: float, warn: bool) -> tuple[Tensor, 
     side = torch.stack([along[1], -along[0], along.new_zeros(())])
     side = -side if float(side[0] if abs(float(side[0])) > 0.5 else side[1]) < 0 else side
     toward = -place.mean(0) * (1 - along.new_tensor([0.0, 0.0, 1.0]))
-    # the origin tells the side, if the path passes it at a distance
+    # if the path passes the origin at a distance, the scene is on the side of the origin
     if float((toward @ side).abs()) > 0.1 * window_m:
         side = side * torch.sign(toward @ side)
     reference_m, height_m = float(antennas.reference_m.median()) / 2, float(place[:, 2].mean())
@@ -257,7 +261,9 @@ class SpotlightImage(TileImage):
         self.side_data, self._own_step = known, step_m is None
 
     def sampling_limits(self, antennas: AntennaPath, frequency_hz: Tensor) -> list[Limit]:
-        """Return the limits of a given spacing, see `PathImage`; none of that of `scene_grid`."""
+        """Return the limits of a given spacing, see `PathImage`. There are none for the spacing of
+        `scene_grid`.
+        """
         return [] if self._own_step else super().sampling_limits(antennas, frequency_hz)
 
     def forward(

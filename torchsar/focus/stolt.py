@@ -57,8 +57,8 @@ class StoltMap:
         """
         residual = residual_frequency(at, self.basis.nodes_hz) / self.step_hz
         real = real_dtype(lines.dtype)
-        # float32 serves for small shifts, which are the rule, and takes half the time; up to 200
-        # grid points it keeps the error of the image below -80 dB
+        # Float32 suffices for small shifts, which are usual, and takes half the time. For shifts up
+        # to 200 grid points it keeps the error of the image below -80 dB.
         near = real == torch.float64 or is_below(residual, 200)
         shift = self.basis.evaluate(residual, real if near else torch.float64)
         start, shift = (self.start, shift) if near else (self.start + shift, None)
@@ -120,8 +120,8 @@ def omega_k_stolt(
     Raises:
         TypeError: If the samples are not complex64 or complex128.
         ValueError: If there are no samples, or if `doppler_hz` or `velocity_m_s` is neither a
-            number nor a tensor in the shape of the leading dims of the data, the velocity is not
-            positive, the magnitude of `doppler_hz` or `frame_hz` is not below 2 velocity /
+            number nor a tensor in the shape of the leading dims of the data. Also if the velocity
+            is not positive, the magnitude of `doppler_hz` or `frame_hz` is not below 2 velocity /
             wavelength, `band_hz` is not positive, or the Doppler band of a squinted aperture does
             not fit the PRF.
     """

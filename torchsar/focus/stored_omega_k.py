@@ -67,9 +67,9 @@ class InvertibleOmegaK:
     Raises:
         TypeError: If `like` is not complex64 or complex128.
         ValueError: If `like` has no samples, or if `doppler_hz` or `velocity_m_s` is neither a
-            number nor a tensor in the shape of the leading dims of the data, the velocity is not
-            positive, or the magnitude of `doppler_hz` or `frame_hz` is not below 2 velocity /
-            wavelength.
+            number nor a tensor in the shape of the leading dims of the data. Also if the velocity
+            is not positive, or the magnitude of `doppler_hz` or `frame_hz` is not below 2 velocity
+            / wavelength.
     """
 
     def __init__(

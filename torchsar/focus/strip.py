@@ -29,9 +29,10 @@ from torchsar.focus.range_doppler import RangeDoppler
 from torchsar.focus.stolt import OmegaKStolt
 from torchsar.radar import StripmapRadar
 
-# arrays of block size in memory: raw block, its image, and the previous image held by the caller
+# number of arrays of block size in memory: raw block, its image, and the previous image, which the
+# caller still holds
 ARRAYS = 3
-# sine of the squint above which no aperture is computed: waves along the path
+# largest sine of the squint for which an aperture is computed; beyond it, waves run along the path
 _STEEPEST = 1 - 1e-6
 
 
@@ -69,7 +70,9 @@ class StripPlan:
 
     @property
     def blocks(self) -> list[tuple[slice, slice]]:
-        """Raw lines to read and image lines to keep for each block; kept lines tile the strip."""
+        """Raw lines to read and image lines to keep for each block. The kept lines of all blocks
+        cover the strip once.
+        """
         if self.height >= self.n_lines:
             return [(slice(0, self.n_lines), slice(0, self.n_lines))]
         step = (self.height - (self.reach[1] - self.reach[0])) // self.multiple * self.multiple
@@ -156,9 +159,11 @@ def reach_lines(
 
 
 def _frame_shift_s(radar: StripmapRadar, doppler_hz: float, frame_hz: float, range_m: float, top: float) -> float:
-    """Time from the crossing of the frame direction to that of the direction with a Doppler
-    frequency at a range frequency, `top` sampling rates above the carrier, for a target at slant
-    range range_m in the frame.
+    """Time from the crossing of the frame direction to that of the direction with a given Doppler
+    frequency.
+
+    The Doppler frequency applies at a range frequency `top` sampling rates above the carrier.
+    range_m: slant range of the target in the frame.
     """
     ratio = max(0.5, 1 + top * radar.sampling_hz / radar.carrier_hz)
     sin, sin_frame = float(radar.sin_squint(doppler_hz)) / ratio, float(radar.sin_squint(frame_hz))
@@ -210,7 +215,8 @@ def plan_strip(
         )
     height = max((h for h in range(max(least, height // 2), height + 1) if smooth_length(h) == h), default=height)
     step = (height - overlap) // multiple * multiple
-    even = math.ceil(n_lines / math.ceil(n_lines / step) / multiple) * multiple  # so that the last block is no shorter
+    # equal steps, so that the last block is no shorter
+    even = math.ceil(n_lines / math.ceil(n_lines / step) / multiple) * multiple
     height = min(height, smooth_length(overlap + even))
     return StripPlan(n_lines, height, reach, height * line_bytes, multiple)
 
@@ -290,8 +296,8 @@ def focus_block(
     pulse, range_ = axes
     image = focus(Signal(raw, (pulse.part(read.start, read.stop), range_)), **values).data
     del raw
-    # the azimuth transform is circular: an image line outside the block appears at its position
-    # modulo the block
+    # The azimuth transform is circular. An image line outside the block therefore appears at its
+    # position modulo the block.
     factor = image.shape[-2] // (read.stop - read.start)
     first, count = (keep.start - read.start) * factor % image.shape[-2], (keep.stop - keep.start) * factor
     if first + count > image.shape[-2]:

@@ -14,9 +14,10 @@ from torchsar.focus.frame_geometry import FrameGeometry
 from torchsar.focus.omega_k import Focuser
 from torchsar.radar import StripmapRadar
 
-# weight of each pulse at each pixel, of two tensors of one shape (..., pulse, pixel): slow time in
-# seconds since the line of sight that defines the image coordinates, by default that of the beam
-# centre, crossed the pixel; and Doppler of the pixel relative to the centroid in Hz
+# Function that returns the weight of each pulse at each pixel, of two tensors of one shape (...,
+# pulse, pixel). The first is the slow time in seconds since the line of sight that defines the
+# image coordinates crossed the pixel; by default it is that of the beam centre. The second is the
+# Doppler of the pixel relative to the centroid in Hz.
 Aperture = Callable[[Tensor, Tensor], Tensor]
 
 
@@ -121,15 +122,15 @@ def backproject_strip(
         wave_speed_m_s=radar.wave_speed_m_s,
         block_bytes=block_bytes,
     )
-    # the carrier keeps its phase of the range beyond the first sample
+    # the phase of the carrier follows the whole range, also beyond the first sample
     image = image * unit_phasor(-2 * radar.carrier_hz / radar.wave_speed_m_s * beyond, image.dtype)
     return image.unflatten(-1, shape) if shape else image[..., 0]
 
 
 @dataclass(frozen=True)
 class _PixelGeometry:
-    """Range of pixels relative to that at the crossing of the line of sight `frame_hz`, and the
-    weights of the pulses.
+    """Range of pixels relative to that at the crossing of the line of sight `frame_hz`, and weights
+    of the pulses.
     """
 
     radar: StripmapRadar

@@ -172,5 +172,5 @@ class CompiledNufft:
         return compiled(of, Gridding().kernel.error if self.eps is None else self.eps)
 
 
-# choices that `matched_fourier` accepts
+# ways of computing the sum that `matched_fourier` accepts
 Transform = Gridding | ExplicitSum | Resampling | CompiledNufft

@@ -18,7 +18,7 @@ from torchsar.core import Axis, Signal, Stage, check_value, checked_samples, ref
 from torchsar.radar import TriangularLadar
 
 Ramp = Literal["up", "down"]
-# middle of each sweep as a share of the period
+# time of the middle of each sweep, as a share of the period
 _EPOCH = {"up": 0.25, "down": 0.75}
 
 
@@ -275,7 +275,7 @@ def azimuth_matched_filter(
     )
     length = 2 ** math.ceil(math.log2(2 * n - 1 + n - 1))
     lit = torch.minimum(2 * half + 1, torch.full_like(half, n))
-    # the aperture is centred on the pixel, except that of the whole record, which is fixed
+    # the aperture is centred on the pixel; that of the whole record is fixed
     weights, fixed = (
         (1.0, _cosine((lag[n - 1 :, None] - (n - 1) / 2) / n, weighting))
         if whole
@@ -292,14 +292,14 @@ def azimuth_matched_filter(
 
 
 def _cosine(share: Tensor, weighting: float) -> Tensor:
-    """1 - a + a cos(2 pi y / L) at y / L."""
+    """Window 1 - a + a cos(2 pi y / L), given the positions y / L and the weighting a."""
     return 1 - weighting + weighting * torch.cos(2 * math.pi * share)
 
 
 def _half_aperture(
     radar: TriangularLadar, pulse: Axis, range_: Axis, beam_rad: float | None, device: torch.device
 ) -> Tensor:
-    """Pulses to either side of the middle of the aperture, (range,) int64."""
+    """Number of pulses to either side of the middle of the aperture, (range,) int64."""
     beam = radar.beam_rad if beam_rad is None else beam_rad
     r = radar.reference_range_m + range_.values(device)
     if beam is None:

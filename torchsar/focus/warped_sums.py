@@ -174,12 +174,12 @@ def _matrix(of: PulsesToLines, points: Tensor, at: int, count: int) -> Tensor:
 
 
 def _explicit(matrix: Callable[[int, int], Tensor], blocks: list[tuple[int, int]], pulses: Tensor) -> Tensor:
-    """Image lines (..., line, range) of pulses, block by block."""
+    """Form image lines (..., line, range) from pulses, block by block."""
     return torch.cat([matrix(*block).mT @ pulses for block in blocks], -2)
 
 
 def _explicit_adjoint(matrix: Callable[[int, int], Tensor], blocks: list[tuple[int, int]], image: Tensor) -> Tensor:
-    """Pulses (..., pulse, range) of image lines, summed over the blocks."""
+    """Form pulses (..., pulse, range) from image lines, summed over the blocks."""
     parts = [matrix(at, count).conj() @ image[..., at : at + count, :] for at, count in blocks]
     return torch.stack(parts).sum(0)
 
@@ -214,7 +214,8 @@ def _resampled(
     position: Tensor,
     factor: Tensor,
 ) -> Tensor:
-    """Image lines (..., line, range) of pulses, which are read at positions in pulses and weighted.
+    """Form image lines (..., line, range) from pulses, which are interpolated at positions in
+    pulses and multiplied by factors.
 
     Positions and factors have the shape (..., pulse).
     """
@@ -228,7 +229,7 @@ def _resampled(
 
 
 def _resampled_adjoint(image: Tensor, forward: Callable[[Tensor], Tensor], shape: tuple[int, ...]) -> Tensor:
-    """Pulses (..., pulse, range) of image lines; `shape` is (..., pulse)."""
+    """Form pulses (..., pulse, range) from image lines. `shape` is (..., pulse)."""
     trials = np.broadcast_shapes(image.shape[:-2], shape[:-1])
     with torch.enable_grad():
         pulses = image.new_zeros(*trials, shape[-1], image.shape[-1]).requires_grad_()
@@ -262,7 +263,9 @@ def times_of_even_angle(k: Tensor, n_pulse: int, prf_hz: float) -> Tensor:
 
 
 def _table_times(angle: Tensor, k: Tensor, n_pulse: int, prf_hz: float) -> Tensor:
-    """First approximation of these times, linear between the values of the warp at the pulses."""
+    """First approximation of the times of `times_of_even_angle`, linear between the values of the
+    warp at the pulses.
+    """
     table = warp(slow_times(n_pulse + 1, prf_hz, k.device), k)
     piece = (torch.searchsorted(table.contiguous(), angle.contiguous(), right=True) - 1).clamp(0, n_pulse - 1)
     low, high = table.gather(-1, piece), table.gather(-1, piece + 1)
@@ -270,15 +273,15 @@ def _table_times(angle: Tensor, k: Tensor, n_pulse: int, prf_hz: float) -> Tenso
 
 
 def _linear(pulses: Tensor, position: Tensor) -> Tensor:
-    """Linear interpolation of pulses (..., pulse, range) at positions (..., m) in pulses, (..., m,
-    range); extrapolated at the ends.
+    """Interpolate pulses (..., pulse, range) linearly at positions (..., m) in pulses, (..., m,
+    range); extrapolate at the ends.
     """
     piece, right = _piece(position, pulses)
     return (1 - right) * _pulses_at(pulses, piece) + right * _pulses_at(pulses, piece + 1)
 
 
 def _spline(pulses: Tensor, position: Tensor) -> Tensor:
-    """Not-a-knot cubic spline through the pulses, with the shapes of `_linear`."""
+    """Interpolate pulses by a not-a-knot cubic spline, with the shapes of `_linear`."""
     piece, right = _piece(position, pulses)
     parts = torch.view_as_real(pulses.resolve_conj()).movedim(-3, -1).to(torch.float64)
     bend = torch.view_as_complex(second_differences(parts).movedim(-1, -3).contiguous()).to(pulses.dtype)
@@ -297,7 +300,7 @@ def _piece(position: Tensor, pulses: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _pulses_at(pulses: Tensor, index: Tensor) -> Tensor:
-    """pulses[..., index, :] with one index per trial."""
+    """Take pulses[..., index, :] with one index per trial."""
     trials = np.broadcast_shapes(pulses.shape[:-2], index.shape[:-1])
     shape = (*trials, index.shape[-1], pulses.shape[-1])
     return pulses.expand(*trials, *pulses.shape[-2:]).gather(-2, index[..., None].expand(shape))
@@ -325,7 +328,7 @@ def compiled(of: PulsesToLines, eps: float) -> Sum:
 
 
 def _by_library(x: Tensor, points: Tensor, scale: float, eps: float, lines: int) -> Tensor:
-    """Image lines of pulses for lines > 0, otherwise pulses of image lines."""
+    """Form image lines from pulses if `lines` is above 0, otherwise pulses from image lines."""
     trials = np.broadcast_shapes(x.shape[:-2], points.shape[:-1])
     double = x.expand(*trials, *x.shape[-2:]).to(torch.complex128)
     made = _CompiledSum.apply(double, points.expand(*trials, points.shape[-1]), lines, eps)
@@ -333,8 +336,8 @@ def _by_library(x: Tensor, points: Tensor, scale: float, eps: float, lines: int)
 
 
 class _CompiledSum(torch.autograd.Function):
-    """Type 1 into `lines` for lines > 0, otherwise its adjoint; first derivatives in data and
-    points.
+    """Transform of type 1 into `lines` for lines > 0, otherwise its adjoint. It has first
+    derivatives in data and points.
     """
 
     @staticmethod
@@ -369,14 +372,14 @@ class _CompiledSum(torch.autograd.Function):
 
 
 def _slope(lines: Tensor) -> Tensor:
-    """Lines times the derivative of the exponent of the adjoint by the point."""
+    """Lines times the derivative by the point of the exponent of the adjoint."""
     n = lines.shape[-2]
     line = torch.arange(n, dtype=torch.float64, device=lines.device) - n // 2
     return -2j * math.pi * line[:, None] * lines
 
 
 def _compiled(x: Tensor, points: Tensor, lines: int, eps: float) -> Tensor:
-    """One transform of the library per trial, since it takes one set of points at a time."""
+    """Make one transform of the library per trial, because it takes one set of points at a time."""
     library, n, columns = _library(), lines or points.shape[-1], x.shape[-1]
     rows = x.detach().mT.reshape(-1, columns, x.shape[-2]).contiguous().cpu().numpy()
     angles = (
@@ -391,7 +394,7 @@ def _compiled(x: Tensor, points: Tensor, lines: int, eps: float) -> Tensor:
 
 
 def _library() -> Any:
-    """The module finufft; raises ModuleNotFoundError with the name of the extra where it is
+    """Return the module finufft. Raises ModuleNotFoundError with the name of the extra where it is
     missing.
     """
     try:

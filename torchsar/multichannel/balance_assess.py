@@ -5,7 +5,10 @@ or a few points dominate. The deviations therefore follow from the data. The gra
 likelihood is a sum over range cells, whose clutter and noise are independent of each other. Its
 scatter over blocks of cells gives its covariance, and with the Hessian that of the unknowns. What
 leaks coherently into all channels leaves the gradient of each cell at zero and does not count as
-noise. Reference: White 1982 (covariance of a maximum-likelihood estimate whose model has errors).
+noise.
+
+Reference:
+    White 1982 (covariance of a maximum-likelihood estimate whose model has errors).
 """
 
 from __future__ import annotations

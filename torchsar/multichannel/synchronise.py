@@ -9,9 +9,10 @@ Without a direct path, scatterers at rest determine the phases. A channel passes
 at which another one was a pulse before. The channels therefore predict the echo of everything at
 rest from pulse to pulse, whatever the scene is. The remaining phase is the drift of the clocks.
 
-Reference: Remote Sens. 2020, 12, 1703, sections 1 and 2.1, which describe the direct-path reference
-channel, and strong islands and ships at rest as its substitute, without an estimator; Bellettini
-and Pinto 2002 (displaced phase centres, for the path of a synthetic aperture sonar).
+Reference:
+    Remote Sens. 2020, 12, 1703, sections 1 and 2.1, which describe the direct-path reference
+    channel, and strong islands and ships at rest as its substitute, without an estimator;
+    Bellettini and Pinto 2002 (displaced phase centres, for the path of a synthetic aperture sonar).
 """
 
 from __future__ import annotations

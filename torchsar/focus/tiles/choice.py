@@ -19,10 +19,11 @@ from torchsar.focus.tiles.kernels import (
 )
 from torchsar.focus.tiles.scene import Sampled, Scene, some_of
 
-# pulses that one product of the spreading joins, by choice: products of fewer are slow, those of
-# more have more zeros
+# Number of pulses in one product of the spreading, by choice. Products of fewer pulses are slow,
+# those of more have more zeros.
 CHUNK = 64
-# sub-apertures above which each is judged, since the errors of a rough path differ between them
+# number of sub-apertures above which each one is assessed, because the errors of a rough path
+# differ between them
 _FEW_PARTS = 3
 
 
@@ -86,7 +87,8 @@ def choose(scene: Scene, error_db: float) -> Choice:
     Raises:
         ValueError: If none meets the error, or it is not offered.
     """
-    # the kernels reach -130 dB, and the expansion to second order is not meant for more than -20 dB
+    # the kernels reach -130 dB, and the expansion to second order is not suitable for more than -20
+    # dB
     if not -130 <= error_db <= -20:
         raise ValueError(f"error_db of an image by tiles must be -130 to -20 dB, got {error_db:g} dB")
     wanted, best = 10 ** (error_db / 20), math.inf
@@ -123,25 +125,27 @@ def choose(scene: Scene, error_db: float) -> Choice:
 
 
 def _points(scene: Scene, width: int, depth: int, wanted: float) -> list[tuple[int, float]]:
-    """Points of a tile between which weights are interpolated, with the errors that they have: half
-    of the wanted error power at most, a choice.
+    """Number of points of a tile between which weights are interpolated, and their error, for each
+    axis.
+
+    The error takes at most half of the wanted error power, by choice.
     """
     return [scene.points(axis, size, wanted / 2) for axis, size in enumerate((width, depth))]
 
 
 def _choose_slope(scene: Scene, sampled: Sampled, error: float) -> tuple[tuple[int, float, float], float] | None:
-    """Slope of the window in samples, its share of the band, and oversampling of the profiles, for
-    an error of the window, and the error that it has.
+    """Slope of the window in samples, its guard share of the band, and oversampling of the
+    profiles, for a wanted error of the window. And the error that it has.
     """
     found, cells, (low, carrier, high) = [], 24, scene.waves
-    # a tenth more than the sample of pulses has
+    # a tenth more than in the sampled pulses
     most = 1.1 * float(sampled.stretch.abs().max())
     for oversampling in (1.25, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0):
         if found and oversampling * cells > min(found)[0]:
             break  # no slope is short enough
         per_metre = scene.samples_per_metre(oversampling)
-        # share of the sampled band that no wave number of a stretched pulse enters, rounded down so
-        # that few windows are tabulated
+        # Share of the sampled band that no wave number of a stretched pulse enters. It is rounded
+        # down so that few windows are tabulated.
         share = 1 - (max(high - carrier, carrier - low) + carrier * most) / (math.pi * per_metre)
         guard, turns = math.floor(64 * share) / 64, scene.sample_turns(oversampling, sampled.stretch)
         away, reach = sampled.away_m * per_metre, sampled.reach_m * per_metre
@@ -153,8 +157,10 @@ def _choose_slope(scene: Scene, sampled: Sampled, error: float) -> tuple[tuple[i
 
 
 def _hopeless(sizes: tuple[int, int, int, int], other: tuple[int, int, int, int], error: float, wanted: float) -> bool:
-    """Whether sizes cannot meet the error, since another failed by more than any gain: halving a
-    side or doubling the sub-apertures gains 24 dB at most.
+    """True if sizes cannot meet the error, because another choice failed by more than they could
+    gain.
+
+    Halving a side or doubling the number of sub-apertures gains 24 dB at most.
     """
     gain = sum(max(0.0, math.log2(b / a)) for a, b in zip(sizes[:2], other[:2], strict=True))
     gain += max(0.0, math.log2(sizes[2] / other[2]))
@@ -162,12 +168,12 @@ def _hopeless(sizes: tuple[int, int, int, int], other: tuple[int, int, int, int]
 
 
 def _sizes(scene: Scene, error_db: float) -> list[tuple[int, int, int, int]]:
-    """Sizes (width, depth, parts, order), from those of about the fastest image to the slowest.
+    """Sizes (width, depth, parts, order), ordered by the estimated time of the image.
 
-    The time follows from the slopes of the path at pixels that most pulses light, and from the taps
-    and the slope of the window for half of the error, which these usually may take. Its factors in
-    ns are those of 13 plans on one core: per sample of a window or of its spectrum, per flop of a
-    product, per element of the expansion, and per tile.
+    The time follows from the slopes of the path at pixels that most pulses light. It also depends
+    on the taps and the slope of the window for half of the error, which these usually may take. Its
+    factors in ns are those of 13 plans on one core: per sample of a window or of its spectrum, per
+    flop of a product, per element of the expansion, and per tile.
     """
     grid, (low, _, high) = scene.grid, scene.waves
     usual, per_metre, share = (

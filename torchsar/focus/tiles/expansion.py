@@ -25,7 +25,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-# powers of s whose sums over the pulses are formed: 1, s and s^2, to the order of the expansion
+# number of powers of s whose sums over the pulses are formed: 1, s and s^2, the order of the
+# expansion
 MOMENTS = 3
 
 
@@ -133,7 +134,7 @@ class Expansion:
             axes: Axes of the image, float64 (2, 3).
             carrier: Wave number k_c in rad/m.
         """
-        # the reference comes first
+        # the reference is the first pulse
         every = [torch.cat(pair) for pair in zip(reference, places, strict=True)]
         path, a, b = slopes(every, centre, axes)
         bends, climbs = curvatures(every, centre, axes), climb(every, centre, axes)
@@ -157,8 +158,10 @@ class Expansion:
         return cls(centre, axes, reference, path, a0, b0, c0, h0, fit, (a0.mean(), fit.mean(0)), carrier)
 
     def common_phase(self, s: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Phase in rad that all tiles share at the carrier, and its derivative in m with respect to
-        the wave number, of mutually broadcasting s and x in m.
+        """Phase in rad that all tiles have in common at the carrier, and its derivative in m with
+        respect to the wave number.
+
+        s and x (in m) broadcast with each other.
         """
         a, fit = self.common
         bend = 0.5 * (fit[0, 0] * s + fit[1, 0] * s * s)
@@ -205,7 +208,7 @@ class Expansion:
         a, b, c, xy0 = (v.reshape(behind) for v in (self.a, self.b, self.c, self.curvature[:, 1]))
         mean_a, mean = self.common
         k = self.carrier + q
-        # what the terms common to all tiles leave
+        # terms that differ between tiles
         alpha1 = 0.5 * k * (xx1 - mean[0, 0]) * x * x + q * (a * e1 - mean_a * mean[0, 3]) * x
         alpha2 = 0.5 * k * (xx2 - mean[1, 0]) * x * x + q * (a * e2 - mean_a * mean[1, 3] + e1 - mean[0, 3]) * x
         beta0, beta1, beta2 = q * xy0 * x, k * xy1 * x + q * b * e1, k * xy2 * x + q * b * e2

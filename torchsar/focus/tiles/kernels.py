@@ -1,5 +1,5 @@
-"""Window over range and kernel over cross range of the tile imager, with their errors, and the
-polynomials between known values.
+"""Window over range and kernel over cross range of the tile imager, with their errors, and
+polynomial interpolation between known values.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ from torch import Tensor
 
 from torchsar.core.fft import smooth_length
 
-# fineness of the nodes over cross range relative to the band of a tile, by choice: between 2, which
-# has a third more nodes, and 1.25, which needs wider kernels
+# Density of the nodes over cross range relative to the band of a tile, by choice. A density of 2
+# has a third more nodes, and 1.25 needs wider kernels.
 CROSS_OVERSAMPLING = 1.5
-# slopes of the windows in samples, and taps of the kernels, that are offered: up to the errors that
-# double precision and the fit of the nodes allow
+# Slopes of the windows in samples, and taps of the kernels, that are available. They reach the
+# errors that double precision and the fit of the nodes allow.
 _RISES = range(4, 65, 2)
 _TAPS = range(3, 13)
-# turns at which the errors of kernels and windows are tabulated: dense enough for the steep rise of
-# the errors at the edge of a band, where most of their power is
+# Number of frequencies, in cycles, at which the errors of kernels and windows are tabulated. It is
+# dense enough for the steep rise of the errors at the edge of a band, where most of their power is.
 _ENTRIES = 97
-# distances from the last flat sample of a window at which its error is tabulated, in samples; a
-# pixel may lie up to one sample beyond it
+# Distances in samples from the last flat sample of a window at which its error is tabulated. A
+# pixel may lie up to one sample beyond it.
 _DISTANCES = 0.5 * torch.arange(50, dtype=torch.float64, device="cpu") - 0.75
 # _RIDGE: regularisation of the node fit, above the rounding of double precision.
 # _SHARPNESS: beta relative to that of a kernel whose band just ends at the oversampling, found by
@@ -73,8 +73,10 @@ def node_values(at: Tensor, nodes: int, taps: int) -> Tensor:
 
 @functools.cache
 def _kernel_squares(taps: int) -> Tensor:
-    """Mean square errors of phasors between nodes, at `_ENTRIES` equally spaced turns per node over
-    the band of a tile, (turn,).
+    """Mean square errors of phasors between nodes, (turn,).
+
+    They are tabulated at `_ENTRIES` equally spaced frequencies, in cycles per node, over the band
+    of a tile.
     """
     nodes, turns = 32, torch.linspace(-0.5, 0.5, _ENTRIES, dtype=torch.float64) / CROSS_OVERSAMPLING
     low, high = taps / 2, nodes - 1 - taps / 2
@@ -91,7 +93,9 @@ def _kernel_squares(taps: int) -> Tensor:
 
 
 def _shares(at: Tensor, first: float, last: float, entries: int, weight: Tensor | None = None) -> Tensor:
-    """Shares of positions that are nearest to each of some equally spaced entries of a table."""
+    """Shares of the positions that are nearest to each of some equally spaced entries of
+    a table.
+    """
     entry = ((at.flatten() - first) * ((entries - 1) / (last - first))).round().long().clamp(0, entries - 1)
     count = torch.bincount(entry, None if weight is None else weight.flatten(), minlength=entries)
     return count.to(torch.float64) / count.sum()
@@ -156,7 +160,7 @@ def _window_squares(rise: int, guard: float) -> Tensor:
     """
     turns = torch.linspace(-0.5, 0.5, _ENTRIES, dtype=torch.float64)[:, None] * (1 - guard)
     slope, found = window_slope(rise, guard), torch.zeros(_ENTRIES, len(_DISTANCES), dtype=torch.float64)
-    for flat in (len(_DISTANCES), len(_DISTANCES) + 2):  # the farthest is the middle
+    for flat in (len(_DISTANCES), len(_DISTANCES) + 2):  # the farthest distance is in the middle
         length = flat + rise
         weights = torch.cat([slope, slope.new_ones(flat), slope.flip(0)])
         m = torch.arange(flat + 2 * rise, dtype=torch.float64) - flat / 2 - rise
@@ -184,9 +188,9 @@ def window_error(rise: int, guard: float, turns: Tensor, away: Tensor, reach: fl
     """
     edge = (1 - guard) / 2
     flat = window_length(reach, rise) - rise
-    # windows begin at whole samples
+    # windows begin at whole samples, so that pixels lie at fractions of a sample
     at = away.flatten()[:, None] + torch.tensor([-0.375, -0.125, 0.125, 0.375], dtype=torch.float64)
-    # either end has its error
+    # both ends contribute their error
     far = torch.cat([flat / 2 - 1 - at, flat / 2 + at])
     by_turns = _window_squares(rise, guard) @ _shares(far, float(_DISTANCES[0]), float(_DISTANCES[-1]), len(_DISTANCES))
     return math.sqrt(2 * float(_shares(turns, -edge, edge, _ENTRIES) @ by_turns))

@@ -26,22 +26,24 @@ from torchsar.focus.tiles.kernels import (
 )
 from torchsar.focus.tiles.scene import profile_length
 
-# pulses to which the polynomials of a part are fitted, and samples of s for each node to which the
-# values of the nodes are fitted, both by choice: fits to 24 and 64 pulses differed by 0.2 dB at
-# most in 11 geometries, and functions of s are sampled three times as densely as their band needs
+# _FIT_PULSES: pulses to which the polynomials of a part are fitted, by choice. Fits to 24 and 64
+# pulses differed by 0.2 dB at most in 11 geometries.
+# _FIT_DENSITY: samples of s per node to which the values of the nodes are fitted, by choice.
+# Functions of s are then sampled three times as densely as their band needs.
 _FIT_PULSES, _FIT_DENSITY = 64, 2
-# degrees of the remainders in the wave number and in x, which are exact: squares of linear and of
-# quadratic terms
+# degrees of the remainders in the wave number and in x; they are exact, being squares of linear and
+# of quadratic terms
 _WAVE_DEGREE, _PIXEL_DEGREE = 2, 4
-# share of the extent of s that is added at either end so that small changes of the path need no new
-# plan, and least margin so that an extent is never empty, both by choice
+# _MARGIN: share of the extent of s that is added at either end, by choice, so that small changes of
+# the path need no new plan.
+# _LEAST_MARGIN: least margin, by choice, so that an extent is never empty.
 _MARGIN, _LEAST_MARGIN = 0.02, 1e-6
 _TURN = 2 * math.pi
 
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """Frequencies, and the range profiles formed of them.
+    """Frequencies, and the range profiles that are formed of them.
 
     Args:
         n: Number of frequencies.
@@ -75,7 +77,7 @@ class Band:
 
 @dataclass(frozen=True, eq=False)
 class Tables:
-    """What the pulses and tiles of a group need; differentiable in the positions of the antennas.
+    """Tables of the pulses and tiles of a group, differentiable in the positions of the antennas.
 
     Args:
         first: First sample of each window, shape (tile, path, pulse), int64.
@@ -134,7 +136,8 @@ class Part:
             (torch.arange(n, dtype=torch.float64, device=centre.device) - (n - 1) / 2) * grid.step_m
             for n in (choice.width, choice.depth)
         )
-        # points of a tile at which weights are known, and the polynomials between them
+        # points of a tile at which weights are known, and the polynomials that interpolate between
+        # them
         (x, self.of_x), (y, self.of_y) = map(interpolation, (self.x, self.y), choice.points)
         self.offset_m = (y[:, None] * axes[1])[:, None] + x[:, None] * axes[0]
         every = [v[:, self.pulses] for v in every]
@@ -151,7 +154,7 @@ class Part:
         self.samples = self.length + choice.rise
 
     def _extent(self, places: Sequence[Tensor]) -> tuple[float, float]:
-        """Least and largest s of the pulses in the tiles."""
+        """Least and largest s of the pulses in any of the tiles."""
         _, a, b = slopes(places, self.centre, self.axes)
         s = a / (b / self.expansion.b[..., None]) - self.expansion.a[..., None]
         return float(s.min()), float(s.max())
@@ -165,7 +168,9 @@ class Part:
         return (reach + 2 * self.relief_m) / self.band.step_m
 
     def covers(self, places: Sequence[Tensor]) -> bool:
-        """Whether other positions, each float64 (path, pulse, 3), stay within nodes and windows."""
+        """True if other positions, each float64 (path, pulse, 3), stay within the range of the
+        nodes and windows.
+        """
         places = [v[:, self.pulses] for v in places]
         low, high = self._extent(places)
         inside = self.extent[0] <= low and high <= self.extent[1]
@@ -174,7 +179,8 @@ class Part:
     @property
     def table_count(self) -> int:
         """Largest number of complex values in the tables of all tiles for one path."""
-        # positions in the window are whole numbers, weights at nodes real numbers: two make one
+        # positions in the window are integers, and weights at nodes are real, so that two of them
+        # take the memory of one complex number
         real = self.nodes + (0 if self.shares is None else math.prod(self.choice.points))
         return len(self.centre) * self.count * (self.samples + self.length + real // 2 + 1)
 
@@ -208,7 +214,7 @@ class Part:
         values = node_values((s - self.low) / self.node_step, self.nodes, self.choice.taps) / self.length
         constant, path = self.expansion.common_phase(s[:, None], self.x)  # (sample, x)
         per_wave = path / (self.length * self.band.step_m)
-        # in double precision, since the matrix has large values of either sign
+        # double precision is needed, because the matrix has large values of both signs
         phasor = _ramp(constant / _TURN - self.length // 2 * per_wave, per_wave, self.length, torch.complex128)
         moments = torch.cat([values * s**power for power in range(MOMENTS)])
         found = moments @ torch.view_as_real(phasor).reshape(len(s), -1)
@@ -218,7 +224,7 @@ class Part:
 
     @untraced()
     def weights(self, rows: slice, dtype: torch.dtype, height_m: Tensor | None = None) -> Weights:
-        """Compute what forms the pixels of some tiles, for any history.
+        """Compute the factors that form the pixels of some tiles, for any history.
 
         Args:
             rows: Tiles of the part.
@@ -251,7 +257,7 @@ class Part:
         return FlatWeights(moments, [shared * factor for factor in factors], pixels)
 
     def _pixel_path(self, rows: slice, height_m: Tensor | None = None) -> Tensor:
-        """Path of the pixels of some tiles at the reference place in m, float64 (tile, x, y)."""
+        """Path of the pixels of some tiles at the reference position in m, float64 (tile, x, y)."""
         frame = torch.cat([self.axes, torch.linalg.cross(*self.axes)[None]])
         total = torch.zeros((), dtype=torch.float64, device=self.centre.device)
         for place in self.reference:
@@ -279,7 +285,7 @@ class Part:
         nearest = torch.round(at.detach())
         fraction = at - nearest
         first = torch.remainder(nearest.long() - self.samples // 2, band.length)
-        # the carrier becomes k_c / (1 + eps); half a turn per sample centres the spectrum
+        # the carrier becomes k_c / (1 + eps); half a cycle per sample centres the spectrum
         per_sample = band.carrier * band.step_m / _TURN * (1 - 1 / stretch)
         start = band.carrier / _TURN * path - per_sample * (fraction + self.samples // 2)
         before = _ramp(start + self.samples // 2 * 0.5, per_sample + 0.5, self.samples, dtype)
@@ -315,7 +321,7 @@ class Part:
         x = x.view(tiles, paths, pulses, trials, self.samples)
         x = _times(x, tables.before[..., None, :])
         half = (self.samples - self.length) // 2
-        # the slopes overlap outside the part that is used
+        # the slopes of the window overlap outside the part that is used
         y = x[..., half : half + self.length].clone()
         y[..., :half] += x[..., half + self.length :]
         y[..., self.length - half :] += x[..., :half]
@@ -361,7 +367,7 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class FlatWeights:
-    """What forms the pixels of some tiles in the plane of the image.
+    """Factors that form the pixels of some tiles in the plane of the image.
 
     Args:
         moments: Weights of the moments of s, (factor, moment, wave number, tile, x).
@@ -374,8 +380,8 @@ class FlatWeights:
     pixels: Tensor
 
     def sums(self, parts: Sequence[Tensor]) -> Tensor:
-        """Sums of the parts (wave number, tile, trial, x) over wave numbers and factors, (tile,
-        trial, x, y).
+        """Sum the parts (wave number, tile, trial, x) over wave numbers and factors, (tile, trial,
+        x, y).
         """
         image: Tensor | None = None
         for part, along in zip(parts, self.along, strict=True):
@@ -387,7 +393,7 @@ class FlatWeights:
 
 @dataclass(frozen=True, eq=False)
 class RaisedWeights:
-    """What forms the pixels of some tiles at heights above the plane of the image.
+    """Factors that form the pixels of some tiles at heights above the plane of the image.
 
     Args:
         moments: Weights of the moments of s, (factor, moment, wave number, tile, x).
@@ -403,8 +409,8 @@ class RaisedWeights:
     pixels: Tensor
 
     def sums(self, parts: Sequence[Tensor]) -> Tensor:
-        """Sums of the parts (wave number, tile, trial, x) over wave numbers and factors, (tile,
-        trial, x, y).
+        """Sum the parts (wave number, tile, trial, x) over wave numbers and factors, (tile, trial,
+        x, y).
         """
         fine, coarse = self.ramps
         inner, outer = fine.shape[-1], coarse.shape[-1]
@@ -423,7 +429,7 @@ Weights = FlatWeights | RaisedWeights
 
 
 def _times(x: Tensor, factor: Tensor) -> Tensor:
-    """Product, in the memory of x where no gradient is asked for."""
+    """Product, stored in the memory of x if no gradient is required."""
     return x * factor if x.requires_grad or factor.requires_grad else x.mul_(factor)
 
 
@@ -434,8 +440,9 @@ def _ramp(start: Tensor, step: Tensor, n: int, dtype: torch.dtype) -> Tensor:
 
 
 def _spreading(below: Tensor, weights: Tensor, nodes: int) -> tuple[Tensor, Tensor]:
-    """Matrices of the chunks of pulses, from the first node of each pulse, (..., pulse), and the
-    weights of its nodes, (..., pulse, tap).
+    """Matrices of the chunks of pulses that spread them onto nodes.
+
+    below: first node of each pulse, (..., pulse). weights: weights of its nodes, (..., pulse, tap).
     """
     *lead, pulses, taps = weights.shape
     chunks = -(-pulses // CHUNK)
@@ -457,8 +464,8 @@ def _spreading(below: Tensor, weights: Tensor, nodes: int) -> tuple[Tensor, Tens
 
 
 class _Windows(torch.autograd.Function):
-    """Windows of n adjacent samples, or for a size above 0 its adjoint: the sum of windows at their
-    places among so many samples.
+    """Windows of n adjacent samples. For a size above 0 it is the adjoint: the sum of windows at
+    their positions among `size` samples.
     """
 
     @staticmethod
@@ -486,7 +493,7 @@ class _Windows(torch.autograd.Function):
     @staticmethod
     def vmap(info: Any, in_dims: tuple, x: Tensor, index: Tensor, n: int, size: int) -> tuple[Tensor, int]:
         count, joined = info.batch_size, x.movedim(in_dims[0], 0)
-        # the samples of all items stand one after another
+        # the samples of all trials follow each other
         start = torch.arange(count, device=index.device)[:, None] * (size or joined.shape[1])
         every = _Windows.apply(joined.flatten(0, 1), (start + index).reshape(-1), n, count * size)
         return every.unflatten(0, (count, -1)), 0

@@ -116,7 +116,9 @@ class TilePlan:
 
     @property
     def choice(self) -> Choice:
-        """Sizes of the tiles; of several sectors those with the largest predicted error."""
+        """Sizes of the tiles. If there are several sectors, they are those with the largest
+        predicted error.
+        """
         return max((sector.choice for sector in self.sectors), key=lambda choice: choice.error_db)
 
     def _set_path(
@@ -178,7 +180,7 @@ class TilePlan:
         history = checked_samples(history, "TilePlan.image", "pulse, frequency", finite=False)
         history = expanded_history(history, self.antennas, self.frequency_hz, "TilePlan.image")
         lead, size = history.shape[:-2], history.shape[-2:]
-        # trials with paths of their own come first, those that share a path after them
+        # trials with paths of their own come first, then those that have a path in common
         own = (*(1,) * (len(lead) - len(self.antennas.trials)), *self.antennas.trials)
         order = sorted(range(len(lead)), key=lambda d: own[d] != lead[d])
         paths = self.antennas.trials.numel()
@@ -241,7 +243,8 @@ def sector_bounds(places: Sequence[Tensor], grid: ImageGrid, most_rad: float = m
     turned = torch.remainder(torch.atan2(b, a).diff(dim=-1) + math.pi, 2 * math.pi) - math.pi
     angle, bounds = torch.nn.functional.pad(turned.cumsum(-1), (1, 0)), [0]
     extent = float((angle.amax(-1) - angle.amin(-1)).max())
-    most = extent / max(1, math.ceil(extent / most_rad)) * (1 + 1e-9)  # sectors of about equal angles
+    # sectors of about equal angles
+    most = extent / max(1, math.ceil(extent / most_rad)) * (1 + 1e-9)
     while bounds[-1] < angle.shape[-1]:
         ahead = angle[:, bounds[-1] :]
         wide = ((ahead - ahead[:, :1]).abs() > most).any(0)

@@ -25,13 +25,14 @@ from torchsar.focus.image_grid import ImageGrid
 from torchsar.focus.tiles.expansion import Expansion, curvatures, slopes
 from torchsar.focus.tiles.kernels import CROSS_OVERSAMPLING, interpolation
 
-# functions of positions (point, 3): first pulse that lights each, pulse after the last, (point, 2);
-# and weight of each pulse, (point, pulse)
+# Lit: function of positions (point, 3) that returns the first pulse that lights each one and the
+# pulse after the last, (point, 2).
+# Weight: function of positions that returns the weight of each pulse, (point, pulse).
 Lit = Callable[[Tensor], Tensor]
 Weight = Callable[[Tensor], Tensor]
 
-# tiles that share one expansion, by choice: enough that its matrices, which do not depend on the
-# tile, take a small part of the time, and few enough that the zone is small
+# Number of tiles that share one expansion, by choice. It is large enough that its matrices, which
+# do not depend on the tile, take a small part of the time, and small enough that the zone is small.
 TILES_OF_ZONE = 256
 
 
@@ -78,7 +79,7 @@ def tile_heights(grid: ImageGrid, width: int, depth: int) -> Tensor | None:
     if grid.height_m is None:
         return None
     down, right = (-n % size for n, size in zip(grid.counts, (width, depth), strict=True))
-    # tiles that leave the image repeat its last row and column
+    # tiles that extend beyond the image repeat its last row and column
     whole = pad(grid.height_m[None, None], (0, right, 0, down), mode="replicate")[0, 0]
     return whole.unflatten(1, (-1, depth)).unflatten(0, (-1, width)).transpose(1, 2)
 
@@ -210,18 +211,20 @@ class Scene:
         return [v[min(trial, len(v) - 1)] for v in self.judged]
 
     def judging(self, judged: Sequence[Tensor]) -> Scene:
-        """The same for trials with other positions, (trial, pulse, 3) each, in whose tiles the
-        nominal path stays that of the scene.
+        """Return the scene for trials with other positions, (trial, pulse, 3) each. The nominal
+        path of the tiles remains that of this scene.
         """
-        other = copy.copy(self)  # with what it has found of the pulses that light the image
+        other = copy.copy(self)  # the copy keeps the pulses that were found to light the image
         object.__setattr__(other, "judged", judged)
         other.__dict__.pop("farthest", None)
         return other
 
     @functools.cached_property
     def probed(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Pulses that light a lattice of pixels over the whole image: rows (i,) and columns (j,) of
-        the pixels, first pulse of each and the pulse after the last, int64 (i, j, 2).
+        """Pulses that light a lattice of pixels over the whole image.
+
+        Returns the rows (i,) and columns (j,) of the pixels, and the first pulse of each and the
+        pulse after the last, int64 (i, j, 2).
         """
         most = 2 if self.lit is None else 64
         rows, columns = (some_of(0, n, most) for n in self.grid.counts)
@@ -235,7 +238,7 @@ class Scene:
             ValueError: If no pulse lights a pixel of the lattice.
         """
         *at, pulses = self.probed
-        seen = pulses[..., 1] > pulses[..., 0]  # (i, j)
+        seen = pulses[..., 1] > pulses[..., 0]  # shape (i, j)
         if not bool(seen.any()):
             raise ValueError(
                 f"no pulse lights any of {len(at[0])} x {len(at[1])} pixels across the image; image the part "
@@ -247,8 +250,8 @@ class Scene:
 
     @property
     def longest(self) -> tuple[Tensor, tuple[int, int]]:
-        """A pixel of the lattice that most pulses light, or without `lit` nine from edge to edge,
-        (point, 3); the first of these pulses and the one after the last.
+        """Pixel of the lattice that most pulses light, or without `lit` nine pixels from edge to
+        edge, (point, 3); the first of these pulses and the one after the last.
         """
         if self.lit is None:
             return self.spread.reshape(-1, 3), (0, len(self.places[0]))
@@ -272,7 +275,7 @@ class Scene:
 
     @property
     def weighted(self) -> bool:
-        """Whether the sums of pixels have weights."""
+        """True if the sums of pixels have weights."""
         return self.lit is not None or self.weight is not None
 
     def weights(self, points: Tensor) -> Tensor:
@@ -288,7 +291,7 @@ class Scene:
             some = (lit[..., 1] > lit[..., 0]).nonzero()
             some = some[_between(0, len(some), 8)]
             at = torch.stack([rows[some[:, 0]], columns[some[:, 1]]], -1).to(torch.float64)
-        # the pixels lie at different places of the tiles, which end in the image
+        # the pixels lie at different positions in their tiles, which do not extend beyond the image
         place = torch.remainder(torch.arange(1, len(at) + 1)[:, None] * torch.tensor([0.7548776662, 0.5698402910]), 1)
         half = (torch.tensor(sizes, dtype=torch.float64) - 1) / 2
         most = torch.maximum(half, torch.tensor(self.grid.counts) - 1 - half)
@@ -297,7 +300,7 @@ class Scene:
 
     @functools.cached_property
     def _known(self) -> dict[tuple[int, int, float], tuple[int, float]]:
-        """What `points` has found."""
+        """Results that `points` has found."""
         return {}
 
     def points(self, axis: int, size: int, error: float) -> tuple[int, float]:
@@ -318,7 +321,7 @@ class Scene:
         return self._known[axis, size, error]
 
     def _points_found(self, axis: int, size: int, error: float) -> tuple[int, float]:
-        """Find what `points` returns."""
+        """Compute the result of `points`."""
         device, step = self.grid.origin_m.device, self.grid.step_m
         centre = self._some_tiles(*((size, 1) if axis == 0 else (1, size)))
         at = (torch.arange(size, dtype=torch.float64, device=device) - (size - 1) / 2) * step
@@ -349,13 +352,13 @@ class Scene:
 
     @functools.cached_property
     def most(self) -> tuple[float, float]:
-        """Largest extent of a zone in pixels, so that it is lit by few more pulses than a pixel."""
+        """Largest extent of a zone in pixels, so that few more pulses light it than a pixel."""
         rows, columns, lit = self.probed
         first, last = lit.to(torch.float64).unbind(-1)
         seen, middle, pulses = last > first, (first + last) / 2, float((last - first).max())
 
         def extent(at: Tensor, seen: Tensor, middle: Tensor) -> float:
-            # pulses per pixel by which the middle of those that light a pixel moves
+            # pulses per pixel by which the middle of the pulses that light a pixel moves
             span, moved = (
                 torch.where(seen, v, -math.inf).amax(0) - torch.where(seen, v, math.inf).amin(0)
                 for v in (at[:, None].to(middle).expand_as(middle), middle)
@@ -370,8 +373,8 @@ class Scene:
         """Height of the centre of each tile in metres, (tile, tile), and the largest difference of
         a pixel from it.
 
-        Centres have about the mean height of their pixels, in steps: a small change of the heights
-        does not move them, so that the error of the tiles does not jump with it.
+        Centres have about the mean height of their pixels, in steps. A small change of the heights
+        does not move them, so that the error of the tiles does not jump.
         """
         heights = tile_heights(self.grid, width, depth)
         if heights is None:
@@ -381,9 +384,11 @@ class Scene:
         return centre, float((heights - centre[..., None, None]).abs().max())
 
     def zones(self, width: int, depth: int) -> list[tuple[tuple[slice, slice], tuple[int, int]]]:
-        """Slices of the tile numbers along either axis, of zones of about the same extent along
-        both, each with the first pulse that lights it and the pulse after the last; they are equal
-        if none does.
+        """Zones of about the same extent along both axes, as slices of the tile numbers along
+        either axis.
+
+        Each zone has the first pulse that lights it and the pulse after the last; they are equal if
+        none does.
         """
         tiles = (-(-self.grid.counts[0] // width), -(-self.grid.counts[1] // depth))
         total = math.sqrt(TILES_OF_ZONE * width * depth)
@@ -398,7 +403,7 @@ class Scene:
         ]
         if self.lit is None:
             return [(zone, (0, len(self.places[0]))) for zone in found]
-        # nine points of each zone, and those of the lattice that it contains and next to them
+        # nine points of each zone, and those of the lattice that lie in it or next to it
         ends = [
             torch.tensor([(zone[axis].start * size, min(zone[axis].stop * size, n) - 1) for zone in found])
             for axis, (size, n) in enumerate(zip((width, depth), self.grid.counts, strict=True))
@@ -426,7 +431,7 @@ class Scene:
         return low, carrier, high
 
     def node_turns(self, width: int) -> tuple[Tensor, Tensor]:
-        """Turns per node over cross range of the pixels of a tile at three wave numbers, with
+        """Cycles per node over cross range of the pixels of a tile at three wave numbers, with
         weights, both (pixel, 3).
         """
         low, _, high = self.waves
@@ -435,13 +440,13 @@ class Scene:
         return turns, weight[:, None] * _GAUSS_WEIGHT
 
     def samples_per_metre(self, oversampling: float) -> float:
-        """Samples of the range profiles in a path difference of 1 m."""
+        """Number of samples of the range profiles in a path difference of 1 m."""
         low, _, high = self.waves
         n = len(self.frequency_hz)
         return profile_length(n, oversampling) * (high - low) / max(1, n - 1) / (2 * math.pi)
 
     def sample_turns(self, oversampling: float, stretch: Tensor) -> Tensor:
-        """Turns per sample over range of the frequencies of pulses that have some values of eps."""
+        """Cycles per sample over range of the frequencies of pulses with given values of eps."""
         n = len(self.frequency_hz)
         low, carrier, high = self.waves
         some = min(n, 33)
@@ -456,9 +461,10 @@ class Scene:
         return float(curvatures([v[:1] for v in self.places], points, self.grid.axes).abs().max())
 
     def sampled(self, width: int, depth: int, parts: int, order: int, *, dense: bool = False) -> Sampled:
-        """Error of the expansion, and what the window needs, from a sample of zones and pulses.
+        """Error of the expansion, and the properties that the window must have, from a sample of
+        zones and pulses.
 
-        In a dense sample each sub-aperture, if they are not too many, occurs in one of the zones.
+        In a dense sample each sub-aperture, if there are not too many, occurs in one of the zones.
         """
         device, step = self.grid.origin_m.device, self.grid.step_m
         (x, of_x), (y, of_y) = (
@@ -493,8 +499,10 @@ class Scene:
     def _blocks(
         self, width: int, depth: int, parts: int, dense: bool
     ) -> Iterator[tuple[Tensor, Tensor, tuple[int, int], float]]:
-        """Sample of blocks of tiles and pulses: centres of tiles (tile, 3) with weights (tile,),
-        first pulse and pulse after the last, and weight.
+        """Sample of blocks of tiles and pulses.
+
+        Generates the centres of tiles (tile, 3) with weights (tile,), the first pulse and the pulse
+        after the last, and the weight of the block.
         """
         device, (heights, _) = self.grid.origin_m.device, self.relief(width, depth)
         lit = [(zone, pulses) for zone, pulses in self.zones(width, depth) if pulses[1] > pulses[0]]
@@ -515,7 +523,7 @@ class Scene:
                 yield centre, of_tile, (first, last), weight * (last - first)
 
     def _fitted(self, centre: Tensor, first: int, last: int) -> tuple[Expansion, list[Tensor]]:
-        """Expansion of tiles for some of the pulses, and positions on which it is judged."""
+        """Expansion of tiles for some pulses, and the positions at which its error is computed."""
         middle, fitted = (first + last) // 2, some_of(first, last, 24)
         places, reference = [v[fitted] for v in self.places], [v[middle, None] for v in self.places]
         judged = _between(first, last, 16)
@@ -529,8 +537,10 @@ _GAUSS_WEIGHT = torch.tensor([5 / 18, 8 / 18, 5 / 18], dtype=torch.float64, devi
 
 
 def _in_tile(n: int, size: int) -> tuple[Tensor, Tensor]:
-    """Positions in a tile of `size` pixels relative to its middle, in pixels, and the shares of n
-    pixels that lie there; the last tile may be filled in part.
+    """Positions in a tile of `size` pixels relative to its middle, in pixels, and the share of the
+    n pixels that lie there.
+
+    The last tile may be filled only in part.
     """
     number = torch.arange(size, dtype=torch.float64)
     return number - (size - 1) / 2, (n // size + (number < n % size).to(number)) / n
@@ -538,8 +548,10 @@ def _in_tile(n: int, size: int) -> tuple[Tensor, Tensor]:
 
 @functools.cache
 def _pixel_rule(n: int, size: int) -> tuple[Tensor, Tensor]:
-    """Gauss quadrature for the mean over the pixels of `_in_tile`, from the eigenvalues of its
-    Jacobi matrix: nodes in pixels from the middle and weights, (4,) or fewer.
+    """Gauss quadrature for the mean over the pixels of `_in_tile`: nodes in pixels from the middle,
+    and weights, (4,) or fewer.
+
+    It follows from the eigenvalues of the Jacobi matrix of the pixels, see Golub and Welsch 1969.
 
     Reference:
         Golub and Welsch 1969.
@@ -567,7 +579,7 @@ def some_of(first: int, last: int, n: int) -> Tensor:
 
 
 def _gauss_numbers(first: int, last: int) -> tuple[Tensor, Tensor]:
-    """Up to three whole numbers of first..last - 1, with weights for the mean over all."""
+    """Up to three whole numbers of first..last - 1, with weights for the mean over all of them."""
     n = last - first
     if n <= 3:
         return torch.arange(first, last), torch.full((n,), 1 / n, dtype=torch.float64)
@@ -575,13 +587,13 @@ def _gauss_numbers(first: int, last: int) -> tuple[Tensor, Tensor]:
 
 
 def _between(first: int, last: int, n: int) -> Tensor:
-    """At most n whole numbers of first..last - 1, at irregular places."""
+    """At most n whole numbers of first..last - 1, at irregular distances."""
     at = torch.remainder(torch.arange(min(n, last - first), dtype=torch.float64) * 0.6180339887 + 0.31, 1)
     return (first + at * (last - first)).long()
 
 
 def _refuse_other(name: str, found: object, dtype: torch.dtype, size: tuple[int, int]) -> None:
-    """Raise ValueError unless what `lit` or `weight` has returned has a type and a size."""
+    """Raise ValueError unless the result of `lit` or `weight` has the required type and size."""
     if isinstance(found, Tensor) and found.dtype == dtype and found.shape == size:
         return
     what = f"a tensor of {found.dtype} of shape {tuple(found.shape)}" if isinstance(found, Tensor) else type(found)

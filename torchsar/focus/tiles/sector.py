@@ -1,4 +1,4 @@
-"""Images of a geometry by tiles whose pulses see the scene from about the same side."""
+"""Images by tiles for pulses that see the scene from about the same side."""
 
 from __future__ import annotations
 
@@ -21,19 +21,20 @@ from torchsar.focus.tiles.part import Band, Part, Tables
 from torchsar.focus.tiles.scene import Lit, Scene, Weight, part_bounds, tile_centres, tile_heights
 from torchsar.radar.stripmap import LIGHT_M_S
 
-# tables of the pulses, and weights of the tiles, up to this size each (384 MB) are kept for the
-# next image, by choice: what a small machine spares
+# Largest size of the tables of the pulses, and of the weights of the tiles (384 MB each), that are
+# kept for the next image, by choice. A small machine has that much memory to spare.
 _KEPT_BYTES = 3 << 27
 # Number of pairs of tile and trial whose pixels are formed at once, by choice. It is large enough
 # for efficient matrix products, and small enough to limit the memory of each thread and of
 # gradients.
 _GROUP = 16
-# bytes of profiles that are formed at once, by choice: it limits the memory of the padded spectra
+# bytes of profiles that are formed at once, by choice, which limits the memory of the padded
+# spectra
 _PROFILE_BYTES = 1 << 25
 
 
 class _Kept(dict):
-    """What an image has computed and the next one of the same form needs.
+    """Results of an image that the next image of the same form needs.
 
     Args:
         count: Largest number of complex values that one image adds.
@@ -45,18 +46,22 @@ class _Kept(dict):
         self.count, self.share, self.form = count, share, None
 
     def begin(self, dtype: torch.dtype, tiles: int) -> None:
-        """Forget what images of another precision or number of tiles at once have left."""
+        """Discard what images of another precision, or with another number of tiles at once, have
+        left.
+        """
         if self.form != (dtype, tiles):
             self.clear()
             self.form = dtype, tiles
 
     def keep(self, key: tuple, value: Any, dtype: torch.dtype) -> None:
-        """Keep a value unless those of an image of the precision are too large together."""
+        """Keep a value, unless the values of an image of this precision would be too large
+        together.
+        """
         if self.fits(dtype):
             self[key] = value
 
     def fits(self, dtype: torch.dtype) -> bool:
-        """True if the values of an image of the precision are kept."""
+        """True if the values of an image of this precision are kept."""
         return self.count * dtype.itemsize <= self.share * _KEPT_BYTES
 
 
@@ -95,11 +100,12 @@ class Sector:
             self._plan([place.detach() for place in places])
 
     def _plan(self, every: Sequence[Tensor]) -> None:
-        """Choose the sizes and compute what does not depend on the history."""
+        """Choose the sizes, and compute everything that does not depend on the history."""
         nominal = [place.mean(0) for place in every]
         grid = self.grid
         scene = Scene(self.frequency_hz, LIGHT_M_S, nominal, every, grid, self.lit, self.weight)
-        # the second axis of a tile is that of the range, as the pulses see it that light the middle
+        # the second axis of a tile is that of the range, as seen by the pulses that light the
+        # middle
         middle = scene.spread[1, 1][None]
         first, last = scene.lit_pulses(middle)[0].tolist()
         _, a, b = slopes([v[first : max(last, first + 1)] for v in nominal], middle, grid.axes)
@@ -108,7 +114,8 @@ class Sector:
             grid = grid.transposed()
             scene = replace(scene, grid=grid)
         self._scene = scene
-        with torch.device("cpu"):  # tables of the choice lie there whatever the default device
+        # the tables of the choice are on the host, whatever the default device is
+        with torch.device("cpu"):
             self.choice = choice = choose(scene, self.error_db)
         self._size = size = choice.width, choice.depth
         self._band = Band.of(self.frequency_hz, LIGHT_M_S, choice.oversampling)
@@ -141,7 +148,7 @@ class Sector:
         moved._tables = _Kept(len(every[0]) * moved._table_count, self._share)
         with torch.no_grad():
             predicted = self._error_db(every)
-            # predictions of changed paths are within 1 dB, and 3 dB in all are promised
+            # predictions for changed paths are correct within 1 dB, and 3 dB in all are promised
             if predicted <= self.error_db + 2:
                 moved.choice = replace(self.choice, error_db=predicted)
             else:
@@ -162,14 +169,15 @@ class Sector:
 
     def image(self, data: Tensor) -> Tensor:
         """Form the images of histories (path, trial, pulse, frequency), (path * trial, i, j)."""
-        tiles = self._formed(data.transpose(1, 2)).unflatten(0, self._tiles)  # (tile, tile, path * trial, x, y)
+        # shape (tile, tile, path * trial, x, y)
+        tiles = self._formed(data.transpose(1, 2)).unflatten(0, self._tiles)
         image = tiles.permute(2, 0, 3, 1, 4).flatten(1, 2).flatten(-2)
         if self._swapped:
             image = image.mT
         return image[:, : self.grid.counts[0], : self.grid.counts[1]]
 
     def _formed(self, data: Tensor) -> Tensor:
-        """All tiles, (tile, path * trial, x, y), of data (path, pulse, trial, frequency)."""
+        """Form all tiles, (tile, path * trial, x, y), of data (path, pulse, trial, frequency)."""
         profiles = self._profiles(data)
         paths, _, trials, _ = data.shape
         step = max(1, _GROUP // (paths * trials))
@@ -208,7 +216,9 @@ class Sector:
         return torch.cat(found)[torch.argsort(torch.cat(self._numbers))] if grad else tiles
 
     def _profiles(self, data: Tensor) -> Tensor:
-        """Range profiles of data (path, pulse, trial, frequency), their first samples repeated."""
+        """Range profiles of data (path, pulse, trial, frequency), with their first samples repeated
+        at the end.
+        """
         longest = max((part.samples for zone in self._zones for part in zone), default=0)
         length = self._band.length
         whole = data.new_empty(*data.shape[:-1], length + longest)
@@ -226,7 +236,9 @@ class Sector:
         profiles: Tensor,
         height_m: Tensor | None,
     ) -> Tensor:
-        """Pixels of some tiles, summed over the sub-apertures, (tile, path * trial, x, y)."""
+        """Form the pixels of some tiles, summed over the sub-apertures, (tile, path *
+        trial, x, y).
+        """
         paths, _, trials, _ = profiles.shape
         dtype = profiles.dtype
         with untraced():
@@ -253,7 +265,9 @@ class Sector:
         return total
 
     def _weights_of(self, key: tuple, dtype: torch.dtype, make: Callable, *given: Any) -> Any:
-        """What depends on the plan and the precision alone, from the last image if it is kept."""
+        """Result of `make`, which depends only on the plan and the precision, taken from the last
+        image if it was kept.
+        """
         key = *key, dtype
         if key in self._weights:
             return self._weights[key]
@@ -263,7 +277,7 @@ class Sector:
         return found
 
     def _tables_of(self, part: Part, rows: slice, dtype: torch.dtype) -> Tables:
-        """Tables of some tiles, from the last image if they are kept."""
+        """Tables of some tiles, taken from the last image if they were kept."""
         key = part, rows.start, rows.stop, dtype
         places = *self._places, self._reference_m
         fixed = not (torch.is_grad_enabled() and any(v.requires_grad for v in places))

@@ -9,7 +9,10 @@ where there are several.
 The phase ramp delays one channel against another by a fraction of a pulse interval, circularly. At
 the ends of a record, the clutter of the channels is therefore not related by it. A taper over a few
 pulses at either end removes this part, which in clutter of 30 dB dominates the residual after
-whitening. Reference: Reed, Mallett and Brennan 1974 (sample covariance).
+whitening.
+
+Reference:
+    Reed, Mallett and Brennan 1974 (sample covariance).
 """
 
 from __future__ import annotations
