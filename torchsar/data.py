@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 from torch.utils.data import IterableDataset, get_worker_info
 
-from torchsar.core import Draws, Recording, Truth, device_fault
+from torchsar.core import Chain, Draws, Recording, Truth, device_fault
 
 Pair = tuple[Recording, Truth]
 
@@ -116,6 +116,56 @@ class Simulated(IterableDataset[Pair]):
         return replace(self.draws, trials=self.trials[part], case=case[part] if isinstance(case, tuple) else case)
 
 
+def config_chain(
+    config: str | Path,
+    method: str = "recommended",
+    *,
+    case: str | None = None,
+    overrides: Sequence[str] = (),
+    vary: Sequence[str] = (),
+    device: torch.device | str = "cpu",
+) -> Chain:
+    """Return the chain of a config, from its world to the metrics that its stages measure.
+
+        chain = torchsar.data.config_chain("isal_snr", vary=["world.noise.snr_db"])
+        levels = {"given.world.noise.snr_db": torch.linspace(0, 20, 8, dtype=torch.float64)}
+        trace = chain.trace(draws=Draws(1, "run", trials=range(8)), given=levels)
+
+    The first stage is called `world` and simulates what `torchsar run` does; the others are those
+    of the method. With the seed of the config, the case that `torchsar run` draws ("run", and 0 for
+    the system stripmap) and the same trials, all samples and estimates are the same.
+
+    Args:
+        config: Name of a packaged config, or path of a YAML file.
+        method: Name of the method.
+        case: Name of the case, for a config with cases.
+        overrides: Changes of the config, as "key=value" with dotted keys.
+        vary: Numbers of the world that are given per trial, by dotted key.
+        device: Device on which the trials are computed.
+
+    Returns:
+        The chain, which is called with `draws`, and with `given` values "given.KEY" for each of the
+        keys that vary.
+
+    Raises:
+        ValueError: If the config, an override, the case, the method or a key is not valid, or the
+            config processes a recording.
+        ImportError: If a package of the extra `study` is not installed.
+    """
+    bench = _Config(str(config), tuple(overrides), case, None, str(device)).bench
+    if method not in bench.chains:
+        raise ValueError(f"{bench.file} has the methods {', '.join(bench.chains)}, got {method!r}")
+    return bench.chain(method, [_refuse_fixed(bench, key) for key in vary])
+
+
+def _refuse_fixed(bench: Any, key: str) -> str:
+    """The key below `world`; ValueError if it cannot differ between trials."""
+    section, _, rest = key.partition(".")
+    if section != "world" or not bench.system.may_differ(rest, bench.config.world):
+        raise ValueError(f"{bench.file}: vary gives {key!r}, which cannot differ between trials of a batch")
+    return rest
+
+
 @dataclass(frozen=True)
 class _Function:
     """A function that simulates, with a check of its result."""
@@ -177,9 +227,7 @@ class _Config:
         """Numbers of the world that differ between trials, by dotted key below `world`."""
         bench, count, found = self.bench, len(draws.trials or ()), {}
         for key, value in ({} if self.vary is None else self.vary(draws)).items():
-            section, _, rest = key.partition(".")
-            if section != "world" or not bench.system.may_differ(rest, bench.config.world):
-                raise ValueError(f"{bench.file}: vary gives {key!r}, which cannot differ between trials of a batch")
+            rest = _refuse_fixed(bench, key)
             if not isinstance(value, Tensor) or value.shape != (count,):
                 got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
                 raise ValueError(f"{bench.file}: vary must give one number per trial as {key!r}, ({count},), got {got}")

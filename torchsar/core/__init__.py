@@ -29,7 +29,8 @@ whether a device can compute             `device_fault`
 
 from torchsar.core import trees as trees  # registers signals and estimates with torch
 from torchsar.core.alternate import Alternate, Turn
-from torchsar.core.chain import Chain, Trace, Use, use
+from torchsar.core.chain import Chain, Trace
+from torchsar.core.connect import Use, use
 from torchsar.core.draws import Draws, Source
 from torchsar.core.estimate import Estimate, Outcome, counts, settle, worst
 from torchsar.core.fft import (

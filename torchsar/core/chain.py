@@ -6,86 +6,19 @@ import inspect
 import time
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from torchsar.core.connect import Use
+from torchsar.core.draws import Draws
 from torchsar.core.estimate import Estimate
 from torchsar.core.host import gathered_checks
-from torchsar.core.show import Shown, Summary, kind_of, one_number
-from torchsar.core.signal import Recording, Signal
+from torchsar.core.show import Shown, Summary, content, kind_of, one_number
+from torchsar.core.signal import Recording, Signal, Truth
 
 Given = Mapping[str, Tensor | Estimate]
-
-
-class Use(nn.Module):
-    """Stage together with the sources of its keyword values; made by the function `use`.
-
-    >>> from torchsar import compensate, use
-    >>> use(compensate.CorrectPulsePhase(), phase_rad="phase").names
-    {'phase_rad': 'phase.phase_rad'}
-
-    Args:
-        stage: Stage whose `forward` takes the values.
-        names: Source of each parameter of `forward`: "STAGE.VALUE" for the value VALUE that the
-            stage named STAGE of the chain estimates, "aux.NAME" for side data of the recording, or
-            "given.NAME" for a value that the caller of the chain gives.
-        in_doubt: What the stage does in trials whose estimates are doubtful, see `use`.
-    """
-
-    def __init__(self, stage: nn.Module, names: Mapping[str, str], in_doubt: str = "apply") -> None:
-        super().__init__()
-        self.stage = stage
-        self.names = dict(names)
-        self.in_doubt = in_doubt
-
-
-def use(stage: nn.Module, *, in_doubt: str = "apply", **names: str) -> Use:
-    """Connect parameters of a stage to values of earlier stages or to recorded side data.
-
-    >>> from torchsar import Chain, compensate, use
-    >>> correct = use(compensate.CorrectPulsePhase(), phase_rad="phase")
-    >>> Chain(phase=compensate.Sca(), correct=correct)
-    Chain(2 stages
-      phase: Sca, estimates phase_rad
-      correct: CorrectPulsePhase, uses phase_rad from phase.phase_rad)
-
-    Where an estimate failed (`Estimate.failed`), the stage gets the neutral value of the estimator
-    in place of the estimated one, for example no phase error or the nominal velocity. A stage that
-    both estimates and corrects an error leaves the signal unchanged there. Doubtful estimates are
-    used, unless `in_doubt="neutral"` treats them as failed ones.
-
-    Args:
-        stage: Stage whose `forward` takes the values.
-        in_doubt: What the stage does in trials whose estimates are doubtful: "apply" takes the
-            estimated values, "neutral" the neutral ones.
-        **names: Source of each parameter: "STAGE.VALUE", or "STAGE" alone if the value has the name
-            of the parameter, or "aux.NAME" for side data of the recording, or "given.NAME" for a
-            value that the caller of the chain gives.
-
-    Returns:
-        The stage with its sources, to be given to a `Chain`.
-
-    Raises:
-        TypeError: If a source is not a name, since a constant belongs in the constructor of the
-            stage, or if the stage already is the result of `use`.
-        ValueError: If `in_doubt` is neither "neutral" nor "apply".
-    """
-    if isinstance(stage, Use):
-        raise TypeError("the stage has its connections from `use` already; connect all its parameters in one call")
-    if in_doubt not in ("neutral", "apply"):
-        raise ValueError(
-            f"in_doubt must be 'apply' (estimated values where an estimate is doubtful) or 'neutral' (neutral ones), "
-            f"got {in_doubt!r}"
-        )
-    for parameter, source in names.items():
-        if not isinstance(source, str):
-            raise TypeError(
-                f"{parameter}={source!r}: `use` connects values by name, such as "
-                f"{parameter}='doppler'; pass a constant to the constructor of the stage instead"
-            )
-    sources = {key: source if "." in source else f"{source}.{key}" for key, source in names.items()}
-    return Use(stage, sources, in_doubt)
 
 
 @dataclass(frozen=True, repr=False)
@@ -104,7 +37,8 @@ class Trace(Shown):
         inputs: Signal before each stage.
         outputs: Signal after each stage.
         estimates: Estimates of the stages that returned an Estimate.
-        values: Estimated and given values under "STAGE.VALUE", side data under "aux.NAME".
+        values: Estimated and given values under "STAGE.VALUE", side data under "aux.NAME", true
+            values of a simulation under "truth.NAME".
         seconds: Wall time of each stage, in seconds; empty inside a program of `torch.compile`.
         bytes: Size of the samples after each stage, in bytes.
         neutral: Trials in which a stage did not use an estimate, because it failed or, with
@@ -115,6 +49,9 @@ class Trace(Shown):
         doubtful: Trials in which a stage used a doubtful estimate, by the same names.
         arguments: Values that each stage received from its connections, by its name and parameter;
             neutral where the estimate was not used.
+        metrics: Numbers of the stages that measure, under "STAGE", or "STAGE.NAME" if there are
+            several.
+        truth: True values, if a stage of the chain simulates or impairs the recording.
     """
 
     inputs: Mapping[str, Signal]
@@ -126,6 +63,8 @@ class Trace(Shown):
     neutral: Mapping[str, Tensor] = field(default_factory=dict)
     doubtful: Mapping[str, Tensor] = field(default_factory=dict)
     arguments: Mapping[str, Mapping[str, Tensor]] = field(default_factory=dict)
+    metrics: Mapping[str, Tensor] = field(default_factory=dict)
+    truth: Truth | None = None
 
     @property
     def signal(self) -> Signal:
@@ -141,7 +80,10 @@ class Trace(Shown):
             stages.append(
                 (name, f"{kind_of(signal.data)} of {' and '.join(signal.names)}", found, self._used(name), took)
             )
-        return Summary(f"{sum(self.seconds.values()):.3g} s", {"signals, estimates and times after stages": stages})
+        tables = {"signals, estimates and times after stages": stages}
+        if self.metrics:
+            tables["metrics"] = [(name, content(value)) for name, value in self.metrics.items()]
+        return Summary(f"{sum(self.seconds.values()):.3g} s", tables)
 
     def _used(self, name: str) -> str:
         """Numbers of trials in which a stage used neutral or doubtful values, as words."""
@@ -165,6 +107,10 @@ class _Known:
     estimates: dict[str, Estimate]
     held: frozenset[str] = frozenset()
     stages: frozenset[str] = frozenset()
+    radar: Any = None
+    metrics: dict[str, Tensor] = field(default_factory=dict)
+    clean: Recording | None = None
+    draws: Draws | None = None
 
     def with_given(self, given: Given, stages: Mapping[str, nn.Module]) -> _Known:
         """These values, replaced by those that the caller gives for the stages of a chain."""
@@ -172,7 +118,8 @@ class _Known:
             raise TypeError(f"`given` must map names to values or estimates, got {type(given).__name__}")
         values = {name: value for name, value in given.items() if not isinstance(value, Estimate)}
         estimates = {name: value for name, value in given.items() if isinstance(value, Estimate)}
-        known = _Known({**self.values, **values}, dict(self.estimates), frozenset(values), frozenset(estimates))
+        held = {"held": frozenset(values), "stages": frozenset(estimates)}
+        known = replace(self, values={**self.values, **values}, estimates=dict(self.estimates), **held)
         for name, estimate in estimates.items():
             _check_trials(name, estimate)
             known.add(name, _with_neutral(estimate, stages.get(name)))
@@ -182,6 +129,26 @@ class _Known:
         """Add the estimate of a stage, without values that the caller gives."""
         self.estimates[name] = estimate
         self.values |= {f"{name}.{key}": v for key, v in estimate.value.items() if f"{name}.{key}" not in self.held}
+
+    def recording(self, signal: Signal) -> Recording:
+        """A signal with the radar and the side data."""
+        return Recording(signal, self.radar, self._under("aux."))
+
+    @property
+    def truth(self) -> Truth | None:
+        """True values; None without a simulation."""
+        values = self._under("truth.")
+        return Truth(values, self.clean) if values else None
+
+    def _under(self, prefix: str) -> dict[str, Tensor]:
+        return {name.removeprefix(prefix): value for name, value in self.values.items() if name.startswith(prefix)}
+
+    def take_over(self, recording: Recording, truth: Truth, prefix: str) -> None:
+        """Take the radar, the side data and the true values of a stage that makes a recording."""
+        new = {f"aux.{key}": value for key, value in recording.aux.items()}
+        new |= {f"truth.{prefix}{key}": value for key, value in truth.values.items()}
+        self.values |= {name: value for name, value in new.items() if name not in self.held}
+        self.radar, self.clean = recording.radar, self.clean if truth.clean is None else truth.clean
 
     def origin(self, source: str) -> tuple[Estimate, str] | None:
         """The estimate that a value comes from, and its name there; None if the value is not
@@ -209,6 +176,7 @@ class _Log:
     def trace(self, known: _Known) -> Trace:
         """The trace of the run, with these values and estimates."""
         parts = {name: getattr(self, name) for name in ("seconds", "bytes", "neutral", "doubtful", "arguments")}
+        parts |= {"metrics": known.metrics, "truth": known.truth}
         return Trace(self.inputs, self.outputs, known.estimates, known.values, **parts)
 
 
@@ -229,6 +197,11 @@ class Chain(Shown, nn.Module):
     the trace holds before `start`, and it is differentiable, so that it can serve as the objective
     of a minimum-entropy search. A stage that returns only an Estimate leaves the signal unchanged.
     Connections made by `use` are checked when the chain is built.
+
+    A chain may begin with the world and end with numbers: `echo.Simulate` makes the recording, so
+    that the chain is called with random draws in its place (`chain(draws=Draws(1))`);
+    `echo.Impair` impairs it; and `metrics.Measure` adds metrics to the trace. True values are
+    connected as "truth.NAME": to metrics, or to a stage that shows the best possible result.
 
     An estimate is used except in the trials in which it failed. There later stages get the neutral
     value of the estimator (see `Stage`), and a stage that both estimates and corrects leaves the
@@ -264,28 +237,29 @@ class Chain(Shown, nn.Module):
         for name, stage in self.stages.items():
             uses = " and ".join(f"{parameter} from {source}" for parameter, source in self.uses[name].items())
             doubt = " (neutral if doubtful)" if self.in_doubt[name] == "neutral" else ""
-            gives = " and ".join(_provided(stage))
-            row = (type(stage).__name__, uses and f"uses {uses}{doubt}", gives and f"estimates {gives}")
-            stages.append((name, *row))
+            gives, of = " and ".join(_provided(stage)), stage.extra_repr()
+            kind = f"{type(stage).__name__}{of and f' of {of}'}"
+            stages.append((name, kind, uses and f"uses {uses}{doubt}", gives and f"estimates {gives}"))
         return Summary(f"{len(stages)} stage{'s' * (len(stages) > 1)}", {"stages in their order": stages})
 
     def _check(self) -> None:
         """Reject connections that do not fit, and required values without a connection."""
         available: set[str] = set()
         for name, stage in self.stages.items():
-            parameters = list(inspect.signature(stage.forward).parameters.values())[1:]
+            parameters = _connectable(stage)
             accepted = [p.name for p in parameters]
+            open_ended = any(p.kind is p.VAR_KEYWORD for p in parameters)
             for parameter, source in self.uses[name].items():
-                if parameter not in accepted:
+                if parameter not in accepted and not open_ended:
                     raise ValueError(
                         f"stage {name!r} ({type(stage).__name__}) has no value {parameter!r} to connect; its "
                         f"`forward` accepts {accepted or 'none'}"
                     )
-                if not source.startswith(("aux.", "given.")) and source not in available:
+                if not source.startswith(("aux.", "given.", "truth.")) and source not in available:
                     raise ValueError(
                         f"stage {name!r} uses {source!r}, which no earlier stage provides; available are "
-                        f"{sorted(available) or 'nothing yet'}, 'aux.NAME' for recorded side data, and "
-                        "'given.NAME' for values given to the chain"
+                        f"{sorted(available) or 'nothing yet'}, 'aux.NAME' for recorded side data, 'truth.NAME' for "
+                        "true values, and 'given.NAME' for values given to the chain"
                     )
             for p in parameters:
                 if (
@@ -300,17 +274,22 @@ class Chain(Shown, nn.Module):
                     )
             available |= {f"{name}.{key}" for key in _provided(stage)}
 
-    def forward(self, x: Recording | Signal, given: Given | None = None) -> Signal:
-        """Run all stages of the chain on a recording or a signal.
+    def forward(
+        self, x: Recording | Signal | None = None, given: Given | None = None, *, draws: Draws | None = None
+    ) -> Signal:
+        """Run all stages of the chain on a recording or a signal, or on what it simulates itself.
 
         Args:
-            x: Recording, whose side data are available as "aux.NAME", or a Signal.
+            x: Recording, whose side data are available as "aux.NAME", or a Signal; None for a chain
+                that begins with a simulation.
             given: Values by name. "STAGE.VALUE" and "aux.NAME" replace estimated and recorded
                 values; "given.NAME" sets a value that a stage takes from the caller. A stage for
                 which `given` holds every value that it provides does not run at all, even if it
                 would change the signal. "STAGE" with an Estimate, such as that of an earlier trace,
                 has the same effect; its values count except where they failed, and there the
                 neutral values of the estimate, or of the stage if it has none, are used.
+            draws: Random draws of the stages that simulate or impair a recording. A simulation uses
+                them as they are, an impairment the part with the name of its stage.
 
         Returns:
             Signal after the last stage.
@@ -319,18 +298,23 @@ class Chain(Shown, nn.Module):
             KeyError: If a given value has an unknown name, or a value that a stage is connected to
                 is missing.
             TypeError: If x is neither a Recording nor a Signal, `given` is not a mapping, or a
-                stage returns anything else than a Signal, an Estimate or a pair of both.
-            ValueError: If a value of a given Estimate does not begin with the trial dimensions.
+                stage returns anything else than a Signal, an Estimate, a pair of both, or metrics.
+            ValueError: If a value of a given Estimate does not begin with the trial dimensions, or
+                a stage needs random draws and there are none.
         """
-        return self._run(list(self.stages), *self._start(x, given))
+        return self._run(list(self.stages), *self._start(x, given, draws))
 
-    def trace(self, x: Recording | Signal, given: Given | None = None) -> Trace:
+    def trace(
+        self, x: Recording | Signal | None = None, given: Given | None = None, *, draws: Draws | None = None
+    ) -> Trace:
         """Run all stages of the chain and return every intermediate result, with times and sizes.
 
         Args:
-            x: Recording, whose side data are available as "aux.NAME", or a Signal.
+            x: Recording, whose side data are available as "aux.NAME", or a Signal; None for a chain
+                that begins with a simulation.
             given: Values and estimates by name that replace those estimated or recorded, as in
                 `forward`.
+            draws: Random draws of the stages that simulate or impair a recording.
 
         Returns:
             Trace with the signals, estimates, values, wall times and sizes of all stages.
@@ -339,10 +323,11 @@ class Chain(Shown, nn.Module):
             KeyError: If a given value has an unknown name, or a value that a stage is connected to
                 is missing.
             TypeError: If x is neither a Recording nor a Signal, `given` is not a mapping, or a
-                stage returns anything else than a Signal, an Estimate or a pair of both.
-            ValueError: If a value of a given Estimate does not begin with the trial dimensions.
+                stage returns anything else than a Signal, an Estimate, a pair of both, or metrics.
+            ValueError: If a value of a given Estimate does not begin with the trial dimensions, or
+                a stage needs random draws and there are none.
         """
-        signal, known = self._start(x, given)
+        signal, known = self._start(x, given, draws)
         log = _Log()
         self._run(list(self.stages), signal, known, log)
         return log.trace(known)
@@ -361,7 +346,7 @@ class Chain(Shown, nn.Module):
 
         Raises:
             KeyError: If a stage or a given value has an unknown name.
-            ValueError: If `stop` runs before `start`.
+            ValueError: If `stop` runs before `start`, or a repeated stage simulates or impairs.
         """
         part, known = self._part(trace, start, stop, given)
         return self._run(part, trace.inputs[start], known)
@@ -376,27 +361,44 @@ class Chain(Shown, nn.Module):
 
         Returns:
             Trace with all results of the repeated stages. Of the stages before `start` it holds
-            the signals, values, estimates, arguments and neutral trials of `trace`, but neither
-            times nor sizes.
+            the signals, values, estimates, arguments, metrics and neutral trials of `trace`, but
+            neither times nor sizes.
 
         Raises:
             KeyError: If a stage or a given value has an unknown name.
+            ValueError: If a repeated stage simulates or impairs a recording.
         """
         part, known = self._part(trace, start, None, given)
-        before = [name for name in trace.inputs if name not in part]
-        log = _Log({name: trace.inputs[name] for name in before}, {name: trace.outputs[name] for name in before})
+        before = [name for name in trace.outputs if name not in part]
+        inputs = {name: signal for name, signal in trace.inputs.items() if name in before}
+        log = _Log(inputs, {name: trace.outputs[name] for name in before})
+        known.metrics = {key: x for key, x in trace.metrics.items() if key.partition(".")[0] in before}
         log.arguments |= {name: trace.arguments[name] for name in before}
         for here, there in ((log.neutral, trace.neutral), (log.doubtful, trace.doubtful)):
             here |= {key: mask for key, mask in there.items() if key.partition(".")[0] in before}
         self._run(part, trace.inputs[start], known, log)
         return log.trace(known)
 
-    def _start(self, x: Recording | Signal, given: Given | None) -> tuple[Signal, _Known]:
+    def _start(
+        self, x: Recording | Signal | None, given: Given | None, draws: Draws | None
+    ) -> tuple[Signal | None, _Known]:
         """The signal of a run, and the values that are known before it."""
-        if not isinstance(x, Recording | Signal):
-            raise TypeError(f"a chain runs on a Recording or a Signal, got {type(x).__name__}")
+        random = [name for name, stage in self.stages.items() if _on_recording(stage)]
+        begins = random[:1] == list(self.stages)[:1]
+        if not isinstance(x, Recording | Signal) and not (x is None and begins):
+            raise TypeError(
+                f"a chain runs on a Recording or a Signal, got {type(x).__name__}; only one that begins with a "
+                "simulation (echo.Simulate) makes its own recording"
+            )
+        if random and not isinstance(draws, Draws):
+            raise ValueError(
+                f"stage {random[0]!r} needs random draws, got {type(draws).__name__}; call the chain with "
+                "draws=Draws(1), or draws=Draws(1, trials=range(8)) for eight trials"
+            )
         aux = {f"aux.{name}": value for name, value in x.aux.items()} if isinstance(x, Recording) else {}
-        known = _Known({**aux}, {}).with_given({} if given is None else given, dict(self.stages.named_children()))
+        radar = x.radar if isinstance(x, Recording) else None
+        known = _Known({**aux}, {}, radar=radar, draws=draws)
+        known = known.with_given({} if given is None else given, dict(self.stages.named_children()))
         available = {f"{name}.{key}" for name, stage in self.stages.items() for key in _provided(stage)} | set(aux)
         available |= {source for names in self.uses.values() for source in names.values()}
         unknown = (known.held - available) | (known.stages - set(self.stages))
@@ -413,8 +415,12 @@ class Chain(Shown, nn.Module):
         part = names[names.index(start) : names.index(stop) + 1 if stop else None]
         if not part:
             raise ValueError(f"the chain runs its stages in the order {names}: {stop!r} does not follow {start!r}")
+        random = [name for name in part if _on_recording(self.stages[name])]
+        if random:
+            raise ValueError(f"stage {random[0]!r} makes the recording; a chain is rerun from a stage after it")
         before = {name: estimate for name, estimate in trace.estimates.items() if name not in part}
-        known = _Known(dict(trace.values), before).with_given(
+        clean = None if trace.truth is None else trace.truth.clean
+        known = _Known(dict(trace.values), before, clean=clean).with_given(
             {} if given is None else given, dict(self.stages.named_children())
         )
         unknown = (known.held - set(trace.values)) | (known.stages - set(names))
@@ -424,7 +430,8 @@ class Chain(Shown, nn.Module):
             )
         return part, known
 
-    def _run(self, names: list[str], signal: Signal, known: _Known, log: _Log | None = None) -> Signal:
+    def _run(self, names: list[str], signal: Any, known: _Known, log: _Log | None = None) -> Signal:
+        """The signal after some stages; before a simulation it is None."""
         timed = log is not None and not torch.compiler.is_dynamo_compiling()
         for name in names:
             stage = self.stages[name]
@@ -439,7 +446,8 @@ class Chain(Shown, nn.Module):
                 if timed:
                     _synchronise(signal.data)
                     log.seconds[name] = time.perf_counter() - began
-                log.inputs[name], log.outputs[name] = entered, signal
+                log.inputs |= {} if entered is None else {name: entered}
+                log.outputs[name] = signal
                 log.bytes[name] = signal.data.numel() * signal.data.element_size()
                 log.arguments[name] = arguments
                 for key, estimate in origins.items() if not held or name in known.stages else ():
@@ -471,7 +479,7 @@ class Chain(Shown, nn.Module):
         self,
         name: str,
         stage: nn.Module,
-        signal: Signal,
+        signal: Signal | None,
         arguments: dict[str, Tensor],
         known: _Known,
         origins: dict[str, Estimate],
@@ -479,14 +487,24 @@ class Chain(Shown, nn.Module):
         """The signal after a stage; its estimate joins `known`, and `origins` if the stage corrects
         by it.
         """
+        if _on_recording(stage):
+            assert known.draws is not None
+            before, draws = (None, known.draws) if signal is None else (known.recording(signal), known.draws.part(name))
+            recording, truth = stage(before, draws, **arguments)
+            known.take_over(recording, truth, "" if signal is None else f"{name}.")
+            return recording.signal
         result = stage(signal, **arguments)
+        assert signal is not None
+        if isinstance(result, Mapping):
+            known.metrics |= {f"{name}.{key}" if key else name: value for key, value in result.items()}
+            return signal
         out, estimate = result if isinstance(result, tuple) else (result, None)
         if isinstance(out, Estimate):
             out, estimate = signal, out
         if not isinstance(out, Signal):
             raise TypeError(
                 f"stage {name!r} ({type(stage).__name__}) returned {type(out).__name__}; a stage "
-                "returns a Signal, an Estimate, or (Signal, Estimate)"
+                "returns a Signal, an Estimate, (Signal, Estimate), or metrics by name"
             )
         if estimate is not None:
             known.add(name, estimate)
@@ -501,6 +519,17 @@ def _corrected(signal: Signal, out: Signal, estimate: Estimate) -> bool:
     """Whether a stage that estimates has also changed the samples, on the same axes."""
     same = out.axes == signal.axes and out.data.shape == signal.data.shape and estimate.outcome.shape == signal.trials
     return same and out is not signal
+
+
+def _connectable(stage: nn.Module) -> list[inspect.Parameter]:
+    """Parameters of a stage that `use` can connect; `connects` of one that calls a function."""
+    found = getattr(stage, "connects", None)
+    return list(inspect.signature(stage.forward).parameters.values())[1:] if found is None else list(found)
+
+
+def _on_recording(stage: nn.Module) -> bool:
+    """Whether a stage makes or changes a recording, by random draws."""
+    return getattr(stage, "on_recording", False)
 
 
 def _provided(stage: nn.Module) -> Collection[str]:

@@ -9,6 +9,7 @@ triangular ladar                  `simulate_ladar` for sweeps, `simulate_ladar_r
                                   continuous record; `ladar_echo`
 moving targets, several channels  `simulate_bistatic`; `bistatic_echo`
 any path                          `simulate_path`; `path_echo`
+first stages of a chain           `Simulate` for any of these worlds, `Impair` for any impairment
 impairments of any recording      `apply_impairments`, each an `Impairment`
 lost or misnumbered lines         `LostLines`, `LostGaps`, `LostPulses`, `RepeatedLines`,
                                   `CorruptedNumbers`
@@ -36,6 +37,7 @@ from torchsar.echo.bistatic import bistatic_echo, simulate_bistatic
 from torchsar.echo.channel_errors import ChannelErrors, SynchronisationError
 from torchsar.echo.channels import ChannelImbalance
 from torchsar.echo.dechirped import dechirped_echo
+from torchsar.echo.ends import Impair, Simulate
 from torchsar.echo.interference import Quantiser, Tone, WideInterferer
 from torchsar.echo.jitter import PeriodicJitter
 from torchsar.echo.ladar import ladar_echo, simulate_ladar
@@ -58,6 +60,7 @@ __all__ = [
     "GainSteps",
     "GateJumps",
     "GroundAtRest",
+    "Impair",
     "Impairment",
     "Leakage",
     "LostGaps",
@@ -72,6 +75,7 @@ __all__ = [
     "QuadratureError",
     "Quantiser",
     "RepeatedLines",
+    "Simulate",
     "SinusoidSweepError",
     "SynchronisationError",
     "Tone",

@@ -239,7 +239,7 @@ def simulate_bistatic(
     if world.snr_db is not None:
         noisy = echo + noise(draws, "echo.bistatic.noise", [axis.n for axis in axes], std, dtype, echo.device)
     values = _truths(movers, radar, transmit_m, std)
-    return recorded(noisy, echo, axes, radar, values, impairments, draws, numbered=False)
+    return recorded(noisy, echo, axes, radar, values, impairments, draws, count_lines=False)
 
 
 def _movers(

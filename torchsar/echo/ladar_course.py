@@ -280,4 +280,4 @@ def hand_over(
     for name in ("velocity_m_s", "range_error_m", "range_error_up_m", "range_error_down_m", "log_amplitude"):
         if name in values:
             values[name] = values[name].expand(*trials, -1)
-    return recorded(data, clean, axes, radar, values, impairments, draws, aux, aux, numbered=bool(impairments))
+    return recorded(data, clean, axes, radar, values, impairments, draws, aux, aux, count_lines=bool(impairments))

@@ -181,7 +181,7 @@ def simulate_path(
     history = path_echo(flown.true, points, amplitude[..., None, :] * gain, radar, n_range, dtype)
     std = torch.zeros((), dtype=torch.float64, device=device)
     if world.snr_db is not None:
-        power = _lit_power(history.detach(), gain.detach())
+        power = _lit_power(history, gain)
         std = torch.sqrt(power / 10 ** (per_trial(world.snr_db, 0, history) / 10))
         history = history + noise(draws, "noise", (n_pulse, n_range), std, dtype, device)
     data = range_profiles(history)

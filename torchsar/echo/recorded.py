@@ -83,7 +83,7 @@ def recorded(
     draws: Draws,
     aux: Mapping[str, Tensor] | None = None,
     clean_aux: Mapping[str, Tensor] | None = None,
-    numbered: bool = True,
+    count_lines: bool = True,
 ) -> tuple[Recording, Truth]:
     """Form the recording and its truth, and apply impairments.
 
@@ -98,7 +98,7 @@ def recorded(
         draws: Random draws.
         aux: Recorded side data.
         clean_aux: Side data of the clean recording.
-        numbered: Whether the recording gets line numbers, as by `apply_impairments`.
+        count_lines: Whether the recording gets line numbers, as by `apply_impairments`.
 
     Returns:
         Recording and truth, which holds the true values of the impairments as well.
@@ -107,7 +107,7 @@ def recorded(
     trials = trials_of(draws, tail, data, clean)
     data, clean = (x.expand(*trials, *x.shape[x.ndim - tail :]) for x in (data, clean))
     before = Recording(Signal(data, axes), radar, dict(aux or {}))
-    apply = apply_impairments if numbered else _applied
+    apply = apply_impairments if count_lines else _applied
     recording, found = apply(before, impairments or {}, draws)
     return recording, Truth({**values, **found}, Recording(Signal(clean, axes), radar, dict(clean_aux or {})))
 
@@ -136,11 +136,23 @@ def apply_impairments(
     Returns:
         The impaired recording, and the true values under "<impairment>.<name>".
     """
-    if "line_number" not in recording.aux:
-        data = recording.signal.data
-        lines = torch.arange(data.shape[-2], device=data.device).expand(data.shape[:-1])
-        recording = replace(recording, aux={**recording.aux, "line_number": lines})
-    return _applied(recording, impairments, draws)
+    return _applied(numbered(recording), impairments, draws)
+
+
+def numbered(recording: Recording) -> Recording:
+    """Return a recording with line numbers, 0, 1, ... in the order of its pulses if it has none.
+
+    Args:
+        recording: Recording.
+
+    Returns:
+        Recording with the side data `line_number`.
+    """
+    if "line_number" in recording.aux:
+        return recording
+    data = recording.signal.data
+    lines = torch.arange(data.shape[-2], device=data.device).expand(data.shape[:-1])
+    return replace(recording, aux={**recording.aux, "line_number": lines})
 
 
 def _applied(

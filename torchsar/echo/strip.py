@@ -311,7 +311,7 @@ def simulate(
     echo = stripmap_echo(placed, world, radar, n_pulse, n_range, dtype)
     std = torch.zeros((), dtype=torch.float64, device=device)
     if world.snr_db is not None:
-        std = torch.sqrt(lit_power(echo.detach()).double() / 10 ** (per_trial(world.snr_db, 0, echo) / 10))
+        std = torch.sqrt(lit_power(echo).double() / 10 ** (per_trial(world.snr_db, 0, echo) / 10))
         echo = echo + noise(draws, "noise", (n_pulse, n_range), std, dtype, device)
     values = {
         "crossing_s": placed.crossing_s,

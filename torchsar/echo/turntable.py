@@ -278,7 +278,7 @@ def _noise(echo: Tensor, snr_db: Tensor | float | None, draws: Draws) -> tuple[T
     """Circular Gaussian noise of an echo, and its standard deviation (...,)."""
     if snr_db is None:
         return 0.0, torch.zeros((), dtype=torch.float64, device=echo.device)
-    power = torch.view_as_real(echo.detach()).double().square().sum(-1).mean((-2, -1))
+    power = torch.view_as_real(echo).double().square().sum(-1).mean((-2, -1))
     std = torch.sqrt(power / 10 ** (per_trial(snr_db, 0, echo) / 10))
     return noise(draws, "noise", echo.shape[-2:], std, echo.dtype, echo.device), std
 

@@ -3,6 +3,7 @@
 =================================  =================================================================
 to judge                           what to use
 =================================  =================================================================
+any of these at the end of a chain `Measure`
 sharpness of an image              `entropy`, `contrast`
 image against a reference          `error_db`; with a free gain `error_after_gain_db`, with a shift
                                    `registered_error_db`; `correlation`
@@ -42,6 +43,7 @@ from torchsar.metrics.ladar_bounds import (
     velocity_known_offset_bound_m_s,
     velocity_segmented_bound_m_s,
 )
+from torchsar.metrics.measure import Measure
 from torchsar.metrics.path_bounds import line_of_sight_bound_m
 from torchsar.metrics.phase import phase_rmse, residual_phase, strehl
 from torchsar.metrics.registration import registered_error_db
@@ -49,6 +51,7 @@ from torchsar.metrics.replicas import azimuth_response, replica_level, replica_z
 from torchsar.metrics.rotation_bounds import rotation_bounds
 
 __all__ = [
+    "Measure",
     "azimuth_response",
     "beam_centre_bound_hz",
     "bistatic_bounds",

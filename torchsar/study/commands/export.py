@@ -10,6 +10,7 @@ from torchsar.radar import LocalFrame
 from torchsar.study.output.folder import fresh_result
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.settings.sections import Loaded, cases_of, key_of
+from torchsar.study.trials.batch import last_stage
 from torchsar.study.trials.bench import Bench
 
 
@@ -35,7 +36,7 @@ def export(run: Path, loaded: Loaded, form: str, out: Path, frame: LocalFrame | 
         for case, part in cases_of(loaded).items() if form != "netcdf" else ():
             bench = Bench(part)
             recording = bench.trials(bench.draws(bench.system.address, range(1))).recording
-            last = {key_of(case, name): list(chain.stages.values())[-1] for name, chain in bench.chains.items()}
+            last = {key_of(case, name): last_stage(chain)[1] for name, chain in bench.chains.items()}
             formed = {name: (images[name], stage) for name, stage in last.items() if name in images}
             export_recording(folder, form, key_of(case, "recording"), recording, formed, frame)
         if not any(folder.iterdir()):

@@ -18,11 +18,12 @@ from typing import Annotated, Any, Literal
 
 from torch import Tensor
 
-from torchsar import compensate, echo, focus, multichannel, repair, scene
+from torchsar import compensate, echo, focus, metrics, multichannel, repair, scene
 from torchsar.compensate import Autofocus, EffectiveVelocity, RotationAutofocus, UnevenRotation
 from torchsar.compensate.pulse_phase import CorrectPulsePhase
 from torchsar.core import Alternate, Stage, Turn
 from torchsar.focus import OmegaK, PaddedLines, TargetImage
+from torchsar.metrics import Measure
 from torchsar.multichannel import (
     AlongTrackAutofocus,
     Detector,
@@ -261,6 +262,22 @@ def movers_image(
     return MoversImage(radar, rebuild, removal, extraction, detector, u_a_reach_m_s, assess=assess)
 
 
+def measure(
+    metric: Literal["contrast", "correlation", "entropy", "phase_rmse", "residual_phase", "strehl"],
+    of: Literal["intensity", "amplitude"] | None = None,
+) -> Measure:
+    """Metric at its place in a chain; see `torchsar.metrics.Measure`.
+
+    It may use true values. The metrics of the method get its result by the name of the stage, in
+    each trial the mean of its numbers.
+
+    Args:
+        metric: Function of `torchsar.metrics`. Its parameters after the image are connected.
+        of: Samples that contrast and entropy judge; None for the intensity.
+    """
+    return Measure(getattr(metrics, metric), **({} if of is None else {"of": of}))
+
+
 def drift(velocity_m_s: Tensor | float = 0.0, acceleration_m_s2: Tensor | float = 0.0) -> Polynomial:
     """Constant velocity and acceleration along the line of sight, d = v t + a t^2 / 2.
 
@@ -467,6 +484,7 @@ _BUILT = {
     "compensate": (autofocus, effective_velocity, rotation_and_phase),
     "multichannel": (moving_point_velocity, alternate_velocity, movers_image),
     "focus": (padded_lines,),
+    "metrics": (measure,),
 }
 # keys of stages that choose a form, and that may be left to choose
 _AUTOMATIC = (
@@ -490,6 +508,7 @@ GROUPS: dict[str, dict[str, Callable[..., Any]]] = {
     package.__name__.removeprefix("torchsar."): _public(package)
     for package in (repair, compensate, multichannel, focus)
 }
+GROUPS["metrics"] = {}
 for _group, _made in _BUILT.items():
     GROUPS[_group] |= {one.__name__: one for one in _made}
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchsar import plot
 from torchsar.compensate import autofocus
 from torchsar.core import Chain, Draws, Recording, Signal, Trace
-from torchsar.echo import Impairment, simulate_turntable
+from torchsar.echo import Impairment, Simulate
 from torchsar.echo.turntable import rotation_angle
 from torchsar.focus import AzimuthTransform, CompressDechirped
 from torchsar.focus.inverse_requirements import inverse_requirements
@@ -76,10 +76,8 @@ class Target(World):
         scene, noise = Together(self.scene), self.noise.snr_db
         return TurntableWorld(scene, self.rotation_rad_s, self.motion, self.start_phase, noise, self.fidelity)
 
-    def trials_of(self, radar: InverseRadar, draws: Draws, dtype: torch.dtype, device: str = "cpu") -> Trials:
-        """Simulate recordings with and without phase errors and motion, and the true values."""
-        world, size = self.of(radar), (self.pulses, self.samples)
-        return Trials.of(*simulate_turntable(radar, world, *size, draws, self.impairments, dtype, device), draws, world)
+    def simulation(self, radar: InverseRadar, dtype: torch.dtype) -> Simulate:
+        return Simulate(radar, self.of(radar), self.pulses, self.samples, dtype=dtype, impairments=self.impairments)
 
     def edge(self, draws: Draws) -> tuple[float, float]:
         """Return the largest magnitudes of cross range and range (m) of the scatterers."""

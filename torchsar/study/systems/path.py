@@ -15,8 +15,8 @@ from torch import Tensor
 
 from torchsar import plot
 from torchsar.compensate.pulse_phase.data import without_line
-from torchsar.core import Chain, Draws, Recording, Signal, Trace, per_trial
-from torchsar.echo import Impairment, simulate_path
+from torchsar.core import Chain, Recording, Signal, Trace, per_trial
+from torchsar.echo import Impairment, Simulate
 from torchsar.echo.path import flown_paths, nominal_geometry
 from torchsar.focus import MotionCompensation, OmegaKImage, PathImage, ProcessedBeam, TilePlan, backproject
 from torchsar.focus.path_image import last_image, possible_plans, seen_in
@@ -145,10 +145,8 @@ class Flown(World):
         effects = (self.ground, self.beam, self.window_range_m, self.noise.snr_db)
         return PathWorld(Together(self.scene), *flown, *known, *effects)  # pyright: ignore[reportCallIssue, reportArgumentType]
 
-    def trials_of(self, radar: InverseRadar, draws: Draws, dtype: torch.dtype, device: str) -> Trials:
-        """Simulate recordings, and recordings without impairments whose positions are true."""
-        world, size = self.of(), (self.pulses, self.samples)
-        return Trials.of(*simulate_path(radar, world, *size, draws, self.impairments, dtype, device), draws, world)
+    def simulation(self, radar: InverseRadar, dtype: torch.dtype) -> Simulate:
+        return Simulate(radar, self.of(), self.pulses, self.samples, dtype=dtype, impairments=self.impairments)
 
     @property
     def named_points(self) -> dict[str, tuple[Tensor | float, Tensor | float]]:

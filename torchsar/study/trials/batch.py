@@ -10,7 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchsar.core import Chain, Draws, Estimate, Outcome, Recording, Signal, Trace, Truth
+from torchsar.core import Chain, Estimate, Outcome, Recording, Signal, Trace
+from torchsar.metrics import Measure
 
 OK, OUTCOME = "ok", "outcome"
 IMAGE = ("azimuth", "range")
@@ -35,12 +36,6 @@ class Trials:
     truth: Mapping[str, Tensor]
     count: int = 1
     own: Any = None
-
-    @classmethod
-    def of(cls, recording: Recording, truth: Truth, draws: Draws, own: Any) -> Trials:
-        """Return the trials of a simulation; see `torchsar.echo`."""
-        assert truth.clean is not None
-        return cls(recording, truth.clean, truth.values, len(draws.trials or (0,)), own)
 
     def first(self, *names: str) -> list[Tensor]:
         """Return true values of the first trial by name, one per scatterer or pulse."""
@@ -212,6 +207,11 @@ def used_values(chain: Chain, trace: Trace, name: str) -> list[Tensor]:
 def last_values(trace: Trace, name: str) -> list[Tensor]:
     """Return the last estimate of a value by a chain, in float64; nothing if there is none."""
     return [e.value[name].to(torch.float64) for e in trace.estimates.values() if name in e.value][-1:]
+
+
+def last_stage(chain: Chain) -> tuple[str, Any]:
+    """Return the name of the last stage of a chain that is no metric, and the stage."""
+    return [(name, stage) for name, stage in chain.stages.items() if not isinstance(stage, Measure)][-1]
 
 
 def image_of(signal: Signal, trial: int = 0) -> Signal:

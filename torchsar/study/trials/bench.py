@@ -17,9 +17,20 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchsar.core import Chain, Draws, Estimate, Outcome, Recording, Trace, gathered_checks, is_out_of_memory, use
+from torchsar.core import (
+    Chain,
+    Draws,
+    Estimate,
+    Outcome,
+    Recording,
+    Trace,
+    Truth,
+    gathered_checks,
+    is_out_of_memory,
+    use,
+)
 from torchsar.core.stored import machine_memory_bytes
-from torchsar.echo import apply_impairments
+from torchsar.echo import Simulate, apply_impairments
 from torchsar.study.settings.errors import ConfigError, did_you_mean, one_line
 from torchsar.study.settings.sections import LONGEST_NAME, OF_CHAIN, Loaded, Method
 from torchsar.study.trials.batch import Batch, Judged, Processed, Trials, fault_of_image, rows, verdict
@@ -67,6 +78,34 @@ class Bench:
         self._memo: dict[str, Any] = {}
         self._refuse_reference()
         self.system.check(self)
+
+    def chain(self, name: str, vary: Sequence[str] = ()) -> Chain:
+        """Return the chain of a method that begins with the simulation of the world.
+
+        Args:
+            name: Name of the method.
+            vary: Dotted keys below `world` of numbers that are given per trial, as
+                "given.world.KEY".
+
+        Raises:
+            ConfigError: If the config has a recording in place of a world, or the method repeats a
+                part of another one.
+        """
+        method = self.config.processor[name]
+        if self.recording is not None or method.rerun is not None:
+            raise ConfigError(f"{self.file}: the method {name!r} does not begin with the world; choose another one")
+
+        def simulated(radar: Any, world: Any, n_pulse: int, draws: Draws, **_: Any) -> tuple[Recording, Truth]:
+            trials = self.system.simulate(self, world, draws)
+            return trials.clean if method.input == "clean" else trials.recording, Truth(trials.truth, trials.clean)
+
+        def world(**given: Tensor) -> Any:
+            return self.world(given)
+
+        given = {key: f"given.world.{key}" for key in vary}
+        chain, first = self.chains[name], use(Simulate(self.radar, world, 0, by=simulated), **given)
+        stages = {n: use(s, in_doubt=chain.in_doubt[n], **chain.uses[n]) for n, s in chain.stages.items()}
+        return Chain(world=first, **stages)
 
     def memo(self, name: str, make: Callable[[], Any]) -> Any:
         """Return the object that is kept under a name; `make` makes it when it is first needed."""
@@ -206,7 +245,8 @@ class Bench:
         # without targets there is no code, which is OK, 0
         codes = {stage: pad(rows(e.outcome, trials.count), (1, 0)).amax(1) for stage, e in estimates.items()}
         spent = torch.full((trials.count,), sum(seconds.values()) / trials.count, dtype=torch.float64)
-        judged = replace(judged, metrics={"seconds": spent, **verdict(codes), **judged.metrics})
+        measured = {key: rows(x.detach(), trials.count).double().mean(1) for key, x in trace.metrics.items()}
+        judged = replace(judged, metrics={"seconds": spent, **verdict(codes), **judged.metrics, **measured})
         left = [stage for stage in trace.inputs if trace.outputs[stage] is trace.inputs[stage]]
         used = {"neutral": trace.neutral, "doubtful": trace.doubtful}
         used = {kind: {key: rows(x, trials.count).any(1) for key, x in of.items()} for kind, of in used.items()}
@@ -230,7 +270,7 @@ class Bench:
         shared = self._shared(method, earlier)
         if unknown := sorted(true_names(chain) - trials.truth.keys()):
             raise ValueError(f"it uses truth.{unknown[0]}, which is known of simulated data only")
-        true = {f"given.{key}": trials.truth[key] for key in true_names(chain)}
+        true = {f"{TRUTH}{key}": trials.truth[key] for key in true_names(chain)}
         with self._announced(chain, name):
             trace = chain.trace(recording, {**shared.estimates, **true})
         spent = {stage: shared.seconds[stage] for stage in shared.estimates}
@@ -286,8 +326,8 @@ class Bench:
 
 # errors whose text says what is wrong; torch itself raises RuntimeError
 _PLAIN = (ValueError, TypeError, KeyError, RuntimeError)
-# prefix of true values in a config, and prefix of input values in a chain
-_TRUTH, _GIVEN = "truth.", "given."
+# prefix of true values
+TRUTH = "truth."
 
 
 def build_chains(loaded: Loaded, **context: Any) -> dict[str, Chain]:
@@ -326,7 +366,7 @@ def build_chains(loaded: Loaded, **context: Any) -> dict[str, Chain]:
 def true_names(chain: Chain) -> set[str]:
     """Return the names of the true values that a chain uses."""
     sources = {source for uses in chain.uses.values() for source in uses.values()}
-    return {source.removeprefix(_GIVEN) for source in sources if source.startswith(_GIVEN)}
+    return {source.removeprefix(TRUTH) for source in sources if source.startswith(TRUTH)}
 
 
 def _chain(loaded: Loaded, method: Method, where: str, context: Mapping[str, Any]) -> Chain:
@@ -348,7 +388,7 @@ def _chain(loaded: Loaded, method: Method, where: str, context: Mapping[str, Any
         built[name] = use(
             stage,
             in_doubt=entry.get("in_doubt", "apply"),
-            **_sources(entry.get("uses", {}), method, loaded, path),
+            **_checked_sources(entry, method, loaded, path),
         )
     try:
         return Chain(**built)
@@ -356,11 +396,11 @@ def _chain(loaded: Loaded, method: Method, where: str, context: Mapping[str, Any
         raise ConfigError(f"{loaded.file}: {where}: {one_line(error)}") from None
 
 
-def _sources(uses: Mapping[str, str], method: Method, loaded: Loaded, where: str) -> dict[str, str]:
-    """The sources of the values of a stage; only an oracle may use true values."""
-    found = {}
-    for key, source in uses.items():
-        true, name = source.startswith(_TRUTH), source.removeprefix(_TRUTH)
+def _checked_sources(entry: Mapping[str, Any], method: Method, loaded: Loaded, where: str) -> dict[str, str]:
+    """The sources of the values of a stage; only an oracle and metrics may use true values."""
+    uses = entry.get("uses", {})
+    for key, source in {} if entry["stage"] == "measure" else uses.items():
+        true, name = source.startswith(TRUTH), source.removeprefix(TRUTH)
         if true and not method.oracle:
             raise ConfigError(
                 f"{loaded.file}: {where}.uses.{key}: {source} is a true value; set 'oracle: true' for the method if it "
@@ -370,8 +410,7 @@ def _sources(uses: Mapping[str, str], method: Method, loaded: Loaded, where: str
             raise ConfigError(
                 f"{loaded.file}: {where}.uses.{key}: {source} does not exist{did_you_mean(name, loaded.system.truths)}"
             )
-        found[key] = f"{_GIVEN}{name}" if true else source
-    return found
+    return uses
 
 
 def reason_of(error: Exception, radar: Any) -> str:

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Recording, Signal, Trace
+from torchsar.echo import Simulate
 from torchsar.focus.requirements import Limit, Requirement
 from torchsar.study.names.registry import stages
 from torchsar.study.output.report import Column, Drawn, comparisons
@@ -53,6 +54,17 @@ class World:
             size = value if isinstance(value, int) else len(value)
             if size < least:
                 raise ValueError(f"world needs at least {least} {name}, got {size}")
+
+    def simulation(self, radar: Any, dtype: torch.dtype) -> Simulate:
+        """Return the stage that simulates this world, if there is one for `trials_of`."""
+        raise NotImplementedError(f"{type(self).__name__} has no stage that simulates it")
+
+    def trials_of(self, radar: Any, draws: Draws, dtype: torch.dtype, device: str = "cpu") -> Trials:
+        """Simulate recordings with and without impairments, and the true values."""
+        stage = self.simulation(radar, dtype).to(device)
+        recording, truth = stage(None, draws)
+        assert truth.clean is not None
+        return Trials(recording, truth.clean, truth.values, len(draws.trials or (0,)), stage.world)
 
 
 def named_points(scene: Mapping[str, Any], shown: Mapping[type, int | None]) -> dict[str, int]:
@@ -158,8 +170,7 @@ class System(ABC):
     def simulate(self, bench: Bench, world: Any, draws: Draws) -> Trials:
         """Simulate the trials in `draws`; numbers of the world may differ between trials.
 
-        By default the world does so: it has the method `trials_of(radar, draws, dtype, device)`. A
-        system whose world lacks it overrides this one.
+        By default the world does so by its method `trials_of`.
         """
         return world.trials_of(bench.radar, draws, bench.dtype, bench.device)
 

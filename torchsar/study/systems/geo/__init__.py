@@ -31,7 +31,7 @@ from torchsar.study.systems.geo.judge import (
 )
 from torchsar.study.systems.geo.world import TRUTHS, Points, bistatic_radar, compression_gain_db
 from torchsar.study.trials.batch import IMAGE, OK, Batch, Found, Judged, Processed, Result, Trials
-from torchsar.study.trials.bench import Bench
+from torchsar.study.trials.bench import TRUTH, Bench
 from torchsar.study.trials.system import Column, System
 
 
@@ -263,7 +263,7 @@ class Geo(System):
 
 def _held(chain: Chain, trace: Trace) -> dict[str, Any]:
     """Values that a chain was given or has estimated."""
-    sources = {source for uses in chain.uses.values() for source in uses.values() if source.startswith("given.")}
+    sources = {source for uses in chain.uses.values() for source in uses.values() if source.startswith(TRUTH)}
     return {**trace.estimates, **{source: trace.values[source] for source in sources}}
 
 

@@ -40,7 +40,7 @@ from torchsar.study.systems.geo_ocean.judge import (
     matched,
     ship_metrics,
 )
-from torchsar.study.trials.batch import OK, Found, Judged, Processed, Result, Trials, image_of, verdict
+from torchsar.study.trials.batch import OK, Found, Judged, Processed, Result, Trials, image_of, last_stage, verdict
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.system import Column, System, World
 
@@ -324,8 +324,8 @@ class GeoOcean(System):
 
     def check(self, bench: Bench) -> None:
         for name, chain in bench.chains.items():
-            last = list(chain.stages)[-1]
-            if not isinstance(chain.stages[last], (StationaryImage, MoversImage)):
+            last, stage = last_stage(chain)
+            if not isinstance(stage, (StationaryImage, MoversImage)):
                 raise ConfigError(
                     f"{bench.file}: processor.{name}: system geo_ocean makes images of scenes; end the chain with "
                     f"{self.ending}, not with {last!r}"
@@ -343,7 +343,7 @@ class GeoOcean(System):
 
     def judge(self, bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -> Judged:
         made, stage = made_scenes(trace, bench.radar.speed_m_s), at_rest(bench.chains[name])
-        *before, last = bench.chains[name].stages
+        last, _ = last_stage(bench.chains[name])
         rows, views, reach = [], [], (float(bench.judging.match_m[0]), float(bench.judging.match_m[1]))
         for scene, frame in zip(made, trials.own, strict=True):
             still = frame.still_image(stage)
@@ -363,7 +363,7 @@ class GeoOcean(System):
         if not detail:
             whole |= {f"{ship}.{key}": x for ship, of in ships.items() for key, x in of.items() if key != OK}
         whole = {key: value.expand(trials.count) for key, value in whole.items()}
-        changed = [n for n in before if trace.outputs[n] is not trace.inputs[n]] if detail else []
+        changed = [n for n in trace.outputs if n != last and trace.outputs[n] is not trace.inputs[n]] if detail else []
         steps = {n: image_of(trace.outputs[n]) for n in changed}
         return Judged(whole, ships, view=View(made, views, steps))
 
@@ -408,7 +408,7 @@ class GeoOcean(System):
 
 def _extraction(bench: Bench) -> Extraction:
     """Extraction of the recommended method, which also images the echoes of single ships."""
-    last: Any = list(bench.chains["recommended"].stages.values())[-1]
+    _, last = last_stage(bench.chains["recommended"])
     return last.flow.extraction if isinstance(last, MoversImage) else Extraction()
 
 

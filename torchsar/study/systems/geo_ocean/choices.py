@@ -28,6 +28,7 @@ from torchsar.multichannel.stationary import bulk_error_db, swath_limit
 from torchsar.scene import BandLimited, MovingPoints
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.systems.geo_ocean.judge import FoundTarget, MadeScene, matched, ship_metrics
+from torchsar.study.trials.batch import last_stage
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Alternative, Choice, Measured
 from torchsar.study.trials.system import by_limit
@@ -62,7 +63,7 @@ def requirements(bench: Bench) -> Sequence[Requirement]:
 
 
 def _last(bench: Bench, name: str) -> Any:
-    return list(bench.chains[name].stages.values())[-1]
+    return last_stage(bench.chains[name])[1]
 
 
 def _integration_s(bench: Bench) -> float | None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 
@@ -17,6 +16,7 @@ from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.scene_image import MoversImage
 from torchsar.multichannel.stationary import StationaryImage
 from torchsar.radar import BistaticRadar
+from torchsar.study.trials.batch import last_stage
 
 # half extents in azimuth and range, in metres, in which levels are measured: the sea about a ship,
 # the ship itself, a replica; and in which a ship and its blurred replicas are sought
@@ -229,7 +229,7 @@ class MadeScene:
 
 def at_rest(chain: Chain) -> StationaryImage:
     """The stage of a chain that images what is at rest."""
-    last: Any = list(chain.stages.values())[-1]
+    _, last = last_stage(chain)
     return last.flow.image if isinstance(last, MoversImage) else last
 
 
@@ -245,7 +245,7 @@ def made_scenes(trace: Trace, speed_m_s: float) -> list[MadeScene]:
         One scene for each trial.
     """
     data, axes = trace.signal.data.reshape(-1, *trace.signal.data.shape[-2:]), trace.signal.axes
-    estimate = trace.estimates.get(list(trace.outputs)[-1])
+    estimate = next((e for e in trace.estimates.values() if "conventional" in e.info), None)
     if estimate is None:
         images = [Signal(image, axes) for image in data]
         return [MadeScene(image, image, image) for image in images]

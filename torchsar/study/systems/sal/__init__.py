@@ -7,14 +7,15 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Annotated, Any
 
 import torch
 from torch import Tensor
 
 from torchsar.compensate.radial import SpectrumCorrelation
-from torchsar.core import Draws, Trace
-from torchsar.echo import Impairment, simulate_ladar, simulate_ladar_record
+from torchsar.core import Trace
+from torchsar.echo import Impairment, Simulate, simulate_ladar_record
 from torchsar.metrics import (
     contrast,
     entropy,
@@ -121,13 +122,9 @@ class Ground(World):
         effects = (self.log_amplitude, snr_db, self.fidelity, gate, self.sweep_error, self.calibration)
         return LadarWorld(scene, self.motion, *effects)  # pyright: ignore[reportArgumentType]
 
-    def trials_of(self, radar: TriangularLadar, draws: Draws, dtype: torch.dtype, device: str = "cpu") -> Trials:
-        """Simulate recordings with and without motion, and the true values."""
-        world, made = self.of(), (self.impairments, dtype, device)
-        if self.record is None:
-            return Trials.of(*simulate_ladar(radar, world, self.periods, draws, *made), draws, world)
-        how = (self.record.block_s, self.record.trigger_s, self.record.trigger_known)
-        return Trials.of(*simulate_ladar_record(radar, world, self.periods, draws, *how, *made), draws, world)
+    def simulation(self, radar: TriangularLadar, dtype: torch.dtype) -> Simulate:
+        made = partial(Simulate, radar, self.of(), self.periods, dtype=dtype, impairments=self.impairments)
+        return made() if self.record is None else made(by=simulate_ladar_record, **vars(self.record))
 
     @property
     def named_points(self) -> dict[str, int]:

@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Chain, Draws, Signal, Trace, Truth, wrapped
-from torchsar.echo import Impairment, apply_impairments, simulate
+from torchsar.echo import Impairment, Simulate
+from torchsar.echo.recorded import numbered
 from torchsar.echo.strip import target_energy
 from torchsar.focus import ClosestRange
 from torchsar.focus.requirements import Limit, Requirement, strip_limits
@@ -88,11 +89,12 @@ class Strip(World):
         doppler, scene = self.doppler(radar), Together(self.scene)
         return StripmapWorld(scene, self.beam, self.path, self.velocity_m_s, doppler, self.noise.snr_db)
 
-    def trials_of(self, radar: StripmapRadar, draws: Draws, dtype: torch.dtype, device: str) -> Trials:
-        """Simulate trials: recordings with and without impairments, and what is true of them."""
-        world, size = self.of(radar), (self.lines, self.samples)
-        made = Trials.of(*simulate(radar, world, *size, draws, self.impairments, dtype, device), draws, world)
-        return replace(made, clean=apply_impairments(made.clean, {}, draws)[0])
+    def simulation(self, radar: StripmapRadar, dtype: torch.dtype) -> Simulate:
+        return Simulate(radar, self.of(radar), self.lines, self.samples, dtype=dtype, impairments=self.impairments)
+
+    def trials_of(self, radar: StripmapRadar, draws: Draws, dtype: torch.dtype, device: str = "cpu") -> Trials:
+        made = super().trials_of(radar, draws, dtype, device)
+        return replace(made, clean=numbered(made.clean))
 
     @property
     def named_points(self) -> dict[str, int]:

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from torchsar.core import Chain, Signal, Trace, wrapped
 from torchsar.radar import StripmapRadar
+from torchsar.study.trials.batch import last_stage
 
 log = logging.getLogger("torchsar")
 # metrics of a window of fewer lines or samples would depend on a few targets
@@ -135,7 +136,7 @@ def focus_name(chain: Chain) -> str:
         Name of the stage.
     """
     focusing = [name for name, stage in chain.stages.items() if hasattr(focuser_of(stage), "frame_hz")]
-    return focusing[-1] if focusing else list(chain.stages)[-1]
+    return focusing[-1] if focusing else last_stage(chain)[0]
 
 
 def focuser_of(stage: nn.Module) -> nn.Module:

@@ -1,0 +1,77 @@
+"""Connections of the parameters of stages to values of earlier ones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from torch import nn
+
+
+class Use(nn.Module):
+    """Stage together with the sources of its keyword values; made by the function `use`.
+
+    >>> from torchsar import compensate, use
+    >>> use(compensate.CorrectPulsePhase(), phase_rad="phase").names
+    {'phase_rad': 'phase.phase_rad'}
+
+    Args:
+        stage: Stage whose `forward` takes the values.
+        names: Source of each parameter of `forward`: "STAGE.VALUE" for the value VALUE that the
+            stage named STAGE of the chain estimates, "aux.NAME" for side data of the recording, or
+            "given.NAME" for a value that the caller of the chain gives.
+        in_doubt: What the stage does in trials whose estimates are doubtful, see `use`.
+    """
+
+    def __init__(self, stage: nn.Module, names: Mapping[str, str], in_doubt: str = "apply") -> None:
+        super().__init__()
+        self.stage = stage
+        self.names = dict(names)
+        self.in_doubt = in_doubt
+
+
+def use(stage: nn.Module, *, in_doubt: str = "apply", **names: str) -> Use:
+    """Connect parameters of a stage to values of earlier stages or to recorded side data.
+
+    >>> from torchsar import Chain, compensate, use
+    >>> correct = use(compensate.CorrectPulsePhase(), phase_rad="phase")
+    >>> Chain(phase=compensate.Sca(), correct=correct)
+    Chain(2 stages
+      phase: Sca, estimates phase_rad
+      correct: CorrectPulsePhase, uses phase_rad from phase.phase_rad)
+
+    Where an estimate failed (`Estimate.failed`), the stage gets the neutral value of the estimator
+    in place of the estimated one, for example no phase error or the nominal velocity. A stage that
+    both estimates and corrects an error leaves the signal unchanged there. Doubtful estimates are
+    used, unless `in_doubt="neutral"` treats them as failed ones.
+
+    Args:
+        stage: Stage whose `forward` takes the values.
+        in_doubt: What the stage does in trials whose estimates are doubtful: "apply" takes the
+            estimated values, "neutral" the neutral ones.
+        **names: Source of each parameter: "STAGE.VALUE", or "STAGE" alone if the value has the name
+            of the parameter, or "aux.NAME" for side data of the recording, or "given.NAME" for a
+            value that the caller of the chain gives.
+
+    Returns:
+        The stage with its sources, to be given to a `Chain`.
+
+    Raises:
+        TypeError: If a source is not a name, since a constant belongs in the constructor of the
+            stage, or if the stage already is the result of `use`.
+        ValueError: If `in_doubt` is neither "neutral" nor "apply".
+    """
+    if isinstance(stage, Use):
+        raise TypeError("the stage has its connections from `use` already; connect all its parameters in one call")
+    if in_doubt not in ("neutral", "apply"):
+        raise ValueError(
+            f"in_doubt must be 'apply' (estimated values where an estimate is doubtful) or 'neutral' (neutral ones), "
+            f"got {in_doubt!r}"
+        )
+    for parameter, source in names.items():
+        if not isinstance(source, str):
+            raise TypeError(
+                f"{parameter}={source!r}: `use` connects values by name, such as "
+                f"{parameter}='doppler'; pass a constant to the constructor of the stage instead"
+            )
+    sources = {key: source if "." in source else f"{source}.{key}" for key, source in names.items()}
+    return Use(stage, sources, in_doubt)
