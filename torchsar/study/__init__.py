@@ -17,7 +17,7 @@ __dir__ = __all__.copy
 
 
 def __getattr__(name: str) -> Any:
-    """Import `montecarlo` on first use, because zarr and other packages take a second."""
+    """Import `montecarlo` on first use, because zarr and other packages take a second to import."""
     if name in __all__:
         from torchsar.study import montecarlo
 

@@ -11,9 +11,9 @@ import torch
 
 # parameters of mallopt in malloc.h of the GNU C library
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8
-# freed blocks up to this size are kept: more than a tensor of a batch usually has
+# freed blocks up to this size are kept, which is more than the usual size of a tensor of a batch
 _KEPT_BYTES = 1 << 30
-# versions of the library before 2.35 accept no larger threshold of mmap
+# largest mmap threshold that versions of the library before 2.35 accept
 _OLD_LIMIT_BYTES = 32 << 20
 
 
@@ -38,15 +38,16 @@ def keep_freed_memory() -> bool:
     return (
         any(set_option(_MMAP_THRESHOLD, size) == 1 for size in (_KEPT_BYTES, _OLD_LIMIT_BYTES))
         and set_option(_TRIM_THRESHOLD, _KEPT_BYTES) == 1
-        and set_option(_ARENA_MAX, 1) == 1  # arenas of other threads would return their memory
+        # arenas of other threads would return their memory to the system
+        and set_option(_ARENA_MAX, 1) == 1
     )
 
 
 def _of_c_library(name: str) -> Callable[..., int] | None:
-    """A function of the C library of this process, or None if it has no such function."""
+    """Find a function of the C library of this process; None if there is no such function."""
     try:
         return getattr(ctypes.CDLL(None), name, None) if os.name == "posix" else None
-    except OSError:  # a statically linked interpreter
+    except OSError:  # the interpreter may be linked statically
         return None
 
 
@@ -88,8 +89,8 @@ class PeakMemory:
 
 
 def _resident(field: str, reset: bool = False) -> int | None:
-    """Resident memory of this process (VmRSS) or its peak since the last reset (VmHWM), in bytes;
-    None on systems that do not report it.
+    """Resident memory of this process (VmRSS) in bytes, or its peak since the last reset (VmHWM).
+    It is None on systems that do not report it.
     """
     try:
         if reset:
@@ -101,6 +102,6 @@ def _resident(field: str, reset: bool = False) -> int | None:
 
 
 def wait_for_devices() -> None:
-    """Wait until CUDA has computed what was asked of it, if it is in use."""
+    """Wait until CUDA has finished all computations, if it is in use."""
     if torch.cuda.is_available() and torch.cuda.is_initialized():
         torch.cuda.synchronize()

@@ -17,8 +17,8 @@ from torchsar.study.settings.sections import Loaded, Sweep, checked
 from torchsar.study.settings.text import find_config, override, read_tree
 from torchsar.study.trials.system import System
 
-# modules with the class `SYSTEM` of each system, by name; other packages add systems by the entry
-# point group `torchsar.systems` (name = "package.module")
+# Modules with the class `SYSTEM` of each system, by name. Other packages add systems by the entry
+# point group `torchsar.systems` (name = "package.module").
 _NAMES = ("stripmap", "isal", "isal_rotation", "sal", "geo", "geo_ocean", "path")
 SYSTEMS = {name: f"torchsar.study.systems.{name}" for name in _NAMES}
 
@@ -75,7 +75,7 @@ def load(name: str | Path, overrides: Sequence[str] = ()) -> Loaded:
 
 
 def _beside(tree: Any, folder: Path, key: str = "") -> Any:
-    """A config in which the files that lie beside it, or below its folder, have their paths."""
+    """Return the config with full paths of the files that lie in its folder or below."""
     if isinstance(tree, dict):
         return {name: _beside(part, folder, name) for name, part in tree.items()}
     if isinstance(tree, list):

@@ -1,5 +1,5 @@
-"""The command `torchsar list`: prints what a config may name (systems, stages, scenes and other
-parts of simulated worlds) with the keys of each, and the formats of data files.
+"""The command `torchsar list`: prints the names that a config may use (systems, stages, scenes and
+other parts of simulated worlds) with the keys of each, and the formats of data files.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from torchsar.study.names.registry import GROUPS, WORLD, group_of, stages
 from torchsar.study.settings.signature import Catalogue, Section
 from torchsar.study.trials.system import System
 
-# an argument in a docstring: its name is indented by four columns, further lines by more
+# an argument in a docstring: its name is indented by four columns, its further lines by more
 _ARGUMENT = re.compile(r"^ {4}((?:\w+, )*\w+): (.*(?:\n {5,}.*)*)", re.MULTILINE)
 
 
 def listing(systems: Mapping[str, System]) -> str:
-    """Return what `torchsar list` prints: systems, stages and parts of simulated worlds, with their
-    keys, and the formats of data files.
+    """Return the text that `torchsar list` prints: systems, stages and parts of simulated worlds,
+    with their keys, and the formats of data files.
     """
     lines = ["", "SYSTEMS (the key `system` of a config; a number marked * may differ from trial to trial)"]
     for name, system in systems.items():
@@ -52,8 +52,8 @@ def _entries(catalogue: Catalogue, names: Any) -> list[str]:
 
 
 def _keys(section: Section, above: str = "") -> list[str]:
-    """A line for each key, with its default and its description by the docstring of its target;
-    `NAME` denotes names that a config chooses.
+    """Return a line for each key, with its default and its description from the docstring of its
+    target. `NAME` stands for names that a config chooses.
     """
     described, lines = arguments(section.target), []
     for name, key in section.keys.items():

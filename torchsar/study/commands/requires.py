@@ -1,5 +1,6 @@
-"""The command `torchsar requires`: predicts for a scene, without processing it, which limits of
-methods it exceeds, what simplified models neglect, and which alternatives suffice.
+"""The command `torchsar requires`: makes predictions for a scene without processing it. It predicts
+which limits of methods the scene exceeds, which errors simplified models have, and which
+alternatives suffice.
 """
 
 from __future__ import annotations

@@ -25,7 +25,8 @@ from torchsar.study.trials.system import per_trial_first
 
 log = logging.getLogger("torchsar")
 FILES = ("config.yaml", "metrics.json", "arrays.zarr", "figures", "report.html")
-# metrics.json has only the mean of estimates with more numbers than this; arrays.zarr has all
+# metrics.json has only the mean of estimates with more numbers than this; arrays.zarr has all of
+# them
 _LISTED = 16
 
 
@@ -94,8 +95,8 @@ def run(loaded: Loaded, out: Path, command: str = "torchsar run", device: str = 
 def _chunks(bench: Bench) -> list[range]:
     """Numbers of the trials of each batch of a case."""
     count = 1 if bench.recording is not None else bench.world().trials
-    # largest tensor of a batch in bytes: large enough for efficient calls, and small relative to
-    # the memory of a machine that can process one trial
+    # largest tensor of a batch in bytes; it is large enough for efficient calls, and small relative
+    # to the memory of a machine that can process one trial
     height = max(1, min(count, (256 << 20) // max(1, bench.bytes_per_trial)))
     return [range(first, min(first + height, count)) for first in range(0, count, height)]
 
@@ -114,7 +115,7 @@ def _case(bench: Bench, name: str) -> Result:
         batch = bench.batch(bench.draws(system.address, chunk), keep=keep, detail=True)
         first, n = first or batch, batch.trials.count
         whole = {name: per_trial_first(torch.as_tensor(x), n) for name, x in batch.trials.truth.items()}
-        # true values with one number per trial
+        # true values that have one number per trial
         truth.append({k: x.reshape(n).cpu() for k, x in whole.items() if x.numel() == n and not x.is_complex()})
         for method, outcome in batch.outcomes.items():
             metrics.setdefault(method, []).append(outcome.metrics)
@@ -142,7 +143,7 @@ def _case(bench: Bench, name: str) -> Result:
 
 
 def _reasons(codes: Tensor) -> dict[Outcome, int]:
-    """Number of trials of each outcome, from codes that are NaN in batches without them."""
+    """Number of trials of each outcome; codes are NaN in batches without outcomes."""
     return counts(codes[codes.isfinite()].long())
 
 
@@ -230,7 +231,9 @@ def _method_tree(title: str, name: str, results: Mapping[str, Result]) -> dict[s
 
 
 def _entry(found: Found) -> dict[str, Any]:
-    """Value, standard deviation, `ok` and name of the outcome: lists over trials, or one entry."""
+    """Value, standard deviation, `ok` and name of the outcome of an estimate: lists over trials, or
+    one entry.
+    """
     value, std, codes = found.value, found.std, found.outcome
     if value[0].numel() > _LISTED:
         value = value.double().flatten(1).mean(1)

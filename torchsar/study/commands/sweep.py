@@ -36,11 +36,11 @@ from torchsar.study.trials.batch import OK, Processed
 from torchsar.study.trials.bench import Bench
 
 log = logging.getLogger("torchsar")
-# keys that change only how much is computed or shown are not part of the identity of results
+# keys that change only how much is computed or shown; results do not depend on them
 _NOT_IDENTITY: Any = dict.fromkeys(("sweep", "trade", "title", "seed", "random", "cases", "beyond_limits"), True) | {
     "processor": {"__all__": {"title"}}
 }
-# results that the same trial does not give again, and what follows from others
+# results that differ when the same trial is repeated, and those that follow from others
 _NOT_RESULTS = ("seconds", OK)
 _FIXED = ("sweep", "seed", "random", "data", "title", "trade", "system", "cases")
 
@@ -59,11 +59,13 @@ class SweepTrial:
         self._benches: dict[str, Bench] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        """The state for other processes, without benches: each process builds its own."""
+        """Return the state for other processes, without benches, because each process builds its
+        own.
+        """
         return {"loaded": self.loaded, "device": self.device, "_benches": {}}
 
     def may_differ(self, key: str) -> bool:
-        """Whether the value of a key may differ between the trials of a batch."""
+        """Decide whether the value of a key may differ between the trials of a batch."""
         section, _, rest = key.partition(".")
         return section == "world" and self.loaded.system.may_differ(rest, self.loaded.config.world)
 
@@ -92,7 +94,9 @@ class SweepTrial:
 
 
 def _saved(outcome: Processed, taps: list[str]) -> dict[str, Tensor]:
-    """The last signal of a method, and the outputs of the stages that sweep.save.taps names."""
+    """Return the last signal of a method, and the outputs of the stages that
+    sweep.save.taps names.
+    """
     if outcome.signal is None:
         return {}
     outputs = {} if outcome.trace is None else outcome.trace.outputs
@@ -163,7 +167,7 @@ def sweep(
                 report(record.select(grid.labels), loaded, new, config_text, command)
     except Interrupted as stopped:
         raise Interrupted(f"{stopped} in {out}; go on with --resume") from None
-    except KeyboardInterrupt:  # a second Ctrl-C, or one during the report
+    except KeyboardInterrupt:  # a second Ctrl-C, or one while the report is written
         raise Interrupted(f"finished trials are recorded in {out}; go on with --resume") from None
     except OSError as error:
         raise ConfigError(
@@ -207,7 +211,7 @@ def sweep_grid(loaded: Loaded, trial: SweepTrial) -> Grid:
     grid = make_grid(given, [key for key in given if trial.may_differ(key)], f"{file}: sweep")
     for parameter in grid.parameters:
         ends = {*parameter.values[:1], min(parameter.values), max(parameter.values)} if parameter.batched else ()
-        for value in ends:  # numbers between two accepted ones are accepted
+        for value in ends:  # numbers between two accepted values are accepted too
             Bench(loaded.changed({parameter.name: value}), trial.device)
     for case in grid.cases():
         there = {stage for chain in trial.bench(case.fixed).chains.values() for stage in chain.stages}
@@ -220,9 +224,9 @@ def sweep_grid(loaded: Loaded, trial: SweepTrial) -> Grid:
 
 
 def identity(loaded: Loaded, chains: Iterable[Chain] = ()) -> dict[str, Any]:
-    """Return what the results depend on besides the grid: the seed and the source of the random
-    numbers, all other keys of the config that change results, and the code of the user's own stages
-    in the chains.
+    """Return everything besides the grid that changes the results: the seed and the source of
+    random numbers, all other keys of the config that change results, and the code of the user's own
+    stages.
     """
     return {
         **identity_of_draws(loaded.config.seed, loaded.config.random),

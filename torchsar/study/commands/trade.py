@@ -31,9 +31,9 @@ from torchsar.study.trials.choice import EXACT_DB, Alternative, Choice, Measured
 
 log = logging.getLogger("torchsar")
 FILES = ("config.yaml", "trade.json", "trade.txt", "figures")
-# what the work of an alternative raises where it cannot be done on this scene
+# errors that an alternative raises if it is not possible for this scene
 _FAILURES = (ValueError, TypeError, KeyError, RuntimeError, ArithmeticError)
-# losses below this (dB), those of rounding in double precision, are drawn at it
+# losses below this level (dB) are due to rounding in double precision, and are drawn at this level
 _DRAWN_DB = -150.0
 Row = dict[str, Any]
 
@@ -108,7 +108,7 @@ def compared(choice: Choice, bench: Bench, tolerance: Mapping[str, float]) -> li
 
 @dataclass
 class _Tried:
-    """What was measured of one alternative; `failed` is an error, or a loss that is not finite."""
+    """Measurements of one alternative. `failed` is an error, or a loss that is not finite."""
 
     one: Alternative
     measured: Measured
@@ -121,9 +121,10 @@ class _Tried:
     def again(self) -> None:
         """Run the alternative once more; the first run measures its loss as well."""
         try:
-            # kept memory is returned before memory is measured, which takes time
+            # memory is returned to the system before the peak is measured, which takes time
             with nullcontext() if self.times else PeakMemory(self.device) as peak:
-                # work is repeated for so long (s) that its time is known to a percent or so
+                # the work is repeated for this time in seconds, so that the time of one run is
+                # known to about a percent
                 spent, result = _spent(lambda: self.measured.run(self.one), 0.1 if self.times else 0.0)
             if peak is not None:
                 self.peak_bytes = peak.bytes
@@ -151,7 +152,9 @@ class _Tried:
 
 
 def _spent(work: Callable[[], Any], least_s: float) -> tuple[tuple[float, float], Any]:
-    """Mean CPU and wall time of the work over as many runs as take a given time, and its result."""
+    """Mean CPU and wall time of as many runs of the work as fill a given time, and the result of
+    the work.
+    """
     began, runs = (time.process_time(), time.perf_counter()), 0
     while True:
         result, runs = work(), runs + 1
@@ -179,7 +182,7 @@ def _cells(row: Row, metrics: Sequence[str]) -> tuple[str, ...]:
 
 
 def _draw(name: str, rows: Sequence[Row], tolerance: Mapping[str, float], path: Path) -> None:
-    """Loss over time, with the Pareto front and the tolerance."""
+    """Draw the loss over time, with the Pareto front and the tolerance."""
     metric = next((metric for row in rows for metric in row["loss"] if metric in tolerance), None)
     kept = [row for row in rows if not row["failed"] and metric in row["loss"]]
     if metric is not None and kept:

@@ -20,8 +20,8 @@ from torchsar.study.montecarlo.work import Chunk, Computed, Work
 from torchsar.study.settings.errors import ConfigError, one_line
 
 Task = tuple[Chunk, int | None]
-_QUEUE = 4  # chunks submitted ahead per worker, so that no worker is idle
-_DEATHS = 10  # workers that may die with a chunk before the chunk is taken as the cause
+_QUEUE = 4  # number of chunks submitted ahead per worker, so that no worker is idle
+_DEATHS = 10  # number of workers that may die with a chunk before the chunk counts as the cause
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class InProcess:
 
 
 def _compute(chunk: Chunk, fits: int | None) -> Computed:
-    """Runs in a worker, with the work that its plugin carries."""
+    """Compute a chunk in a worker, with the work that the plugin of the worker carries."""
     from distributed import get_worker
 
     carrier: Any = get_worker().plugins[_PLUGIN]
@@ -52,10 +52,11 @@ _PLUGIN = "torchsar-work"
 
 
 def _plugin(work: Work, threads: int, own: bool) -> Any:
-    """A plugin that sends the work, the number of torch threads and the index of the GPU to every
-    worker, restarted ones included.
+    """Make a plugin that sends the work, the number of torch threads and the index of the GPU to
+    every worker, also to restarted ones.
 
-    own: workers that this program started ignore Ctrl-C, which the program itself handles.
+    own: True if this program started the workers. They then ignore Ctrl-C, which the program itself
+    handles.
     """
     from distributed import WorkerPlugin
 
@@ -65,7 +66,7 @@ def _plugin(work: Work, threads: int, own: bool) -> Any:
         def setup(self, worker: Any) -> None:
             logging.getLogger("distributed.worker").setLevel(
                 logging.CRITICAL
-            )  # a failed trial is reported once, as one sentence
+            )  # a failed trial is reported only once, as one sentence
             torch.set_num_threads(threads)
             keep_freed_memory()
             if own and threading.current_thread() is threading.main_thread():
@@ -76,7 +77,7 @@ def _plugin(work: Work, threads: int, own: bool) -> Any:
 
 
 def _on_own_gpu(work: Work, worker: Any) -> Work:
-    """The work on the GPU with the number of the worker, if there are several GPUs."""
+    """Assign the work to the GPU with the number of the worker, if there are several GPUs."""
     count = torch.cuda.device_count() if work.device == "cuda" else 0
     return replace(work, device=f"cuda:{int(worker) % count}") if count > 1 and str(worker).isdecimal() else work
 
@@ -104,7 +105,7 @@ class Distributed:
         asked, workers = time.monotonic(), self.workers
 
         def submit() -> None:
-            """Fill the queue for the workers that there are; those of a cluster come and go."""
+            """Fill the queue for the present number of workers; those of a cluster come and go."""
             nonlocal asked, workers
             if not self.own and time.monotonic() > asked + 1:
                 asked, workers = time.monotonic(), len(self.client.nthreads())
@@ -138,8 +139,8 @@ def engine(workers: int | None = None, cluster: str | None = None, threads: int 
         workers: Number of worker processes on this machine; None to compute in this process.
         cluster: Address of a running dask scheduler, whose workers are used instead.
         threads: Number of torch threads in each process. The default is 1, because batches that fit
-            the cache do not gain from more (with 2 threads on 2 cores they took 1.4 times as long),
-            and because results then do not depend on the number of cores.
+            into the cache are not faster with more threads (with 2 threads on 2 cores they took 1.4
+            times as long). Results then do not depend on the number of cores either.
 
     Raises:
         ConfigError: If a number is not accepted, both `workers` and `cluster` are given, or no

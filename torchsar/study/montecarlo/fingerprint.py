@@ -1,4 +1,4 @@
-"""Fingerprints of functions: digests of their code and of all values that it uses."""
+"""Fingerprints of functions: digests of their code and of all values that the code uses."""
 
 from __future__ import annotations
 
@@ -30,24 +30,25 @@ from torchsar.study.settings.errors import ConfigError
 # longer descriptions of values are replaced by a digest
 _SHOWN = 40
 _PLAIN = (type(None), bool, int, float, complex, str, bytes, type(Ellipsis))
-# of these objects only those members count that the code names
+# of these objects, only those members are described that the code names
 _NAMESPACES = (ModuleType, argparse.Namespace, SimpleNamespace)
 
 
 def fingerprint(function: Callable[..., Any]) -> dict[str, Any]:
     """Describe a function such that the description changes with its results.
 
-    The description covers the bytecode, constants and names of the function and of functions
-    inside it, its defaults, the values that it closes over, the state of a callable object, and the
-    global names that it uses, among them other functions of the user with all that they use.
-    Functions of installed packages and of the standard library count by name. Line numbers,
-    comments and the docstring do not count. Another version of Python may give another description.
+    The description covers the bytecode, constants and names of the function and of functions inside
+    it, its defaults and the values that it closes over. It also covers the state of a callable
+    object, and the global names that the function uses, among them other functions of the user with
+    all that they use. Functions of installed packages and of the standard library are represented
+    by their names. Line numbers, comments and the docstring do not change the description. Another
+    version of Python may give another description.
 
     Args:
         function: A function, a method, a `functools.partial`, or an object with `__call__`.
 
     Returns:
-        `name`, the qualified name; `code`, a digest of code and defaults; and `uses`, a description
+        `name`, the qualified name; `code`, a digest of code and defaults. And `uses`, a description
         of each value that the function closes over, reads from a global name, or holds as an
         attribute: a short text, or a digest of a longer one.
 
@@ -58,7 +59,7 @@ def fingerprint(function: Callable[..., Any]) -> dict[str, Any]:
     for key, value in sorted((_used(function) if plain else {"object": function}).items()):
         try:
             text = reader.text(value)
-        except Exception as error:  # locks, files and generators refuse with errors of many kinds
+        except Exception as error:  # locks, files and generators raise errors of many kinds
             raise ConfigError(
                 f"sweep: {name_of(function)} uses {key}, whose value cannot be compared with that of a later run "
                 f"({error}); give a version, which counts instead"
@@ -86,7 +87,7 @@ def own_code(modules: Iterable[nn.Module]) -> dict[str, str]:
     tops = {type(part).__module__.partition(".")[0] for module in modules for part in module.modules()}
     found = {}
     for top in sorted(tops - {"torchsar", "torch"}):
-        here = sys.modules.get(top)  # none if it was loaded in another way
+        here = sys.modules.get(top)  # None if the module was loaded in another way
         files = [file for folder in getattr(here, "__path__", ()) for file in sorted(Path(folder).rglob("*.py"))]
         files = files or [Path(getattr(here, "__file__", None) or "")]
         texts = [file.name.encode() + file.read_bytes() for file in files if file.is_file()]
@@ -95,14 +96,16 @@ def own_code(modules: Iterable[nn.Module]) -> dict[str, str]:
 
 
 class _Reader:
-    """Writes values as texts that are equal for values of equal effect, in whatever process."""
+    """Writer of values as texts, which are equal in any process for values of equal effect."""
 
     def __init__(self) -> None:
         self._known: dict[int, tuple[Any, str]] = {}
         self._open: list[int] = []
 
     def text(self, value: Any) -> str:
-        """The text of any value; values that contain themselves end in a reference."""
+        """Text of any value. Where a value contains itself, its text has a reference to the outer
+        value.
+        """
         if type(value) in _PLAIN:
             return f"{type(value).__name__} {value!r}"
         if id(value) in self._open:
@@ -112,11 +115,12 @@ class _Reader:
             kind = value.__qualname__ if isinstance(value, type) else self.text(type(value)).partition("(")[0]
             text = f"{kind}({', '.join(map(self.text, self._parts(value)))})"
             self._open.pop()
-            self._known[id(value)] = value, text  # the value is kept, and with it its id
+            # the value is kept, so that its id is not used for another one
+            self._known[id(value)] = value, text
         return self._known[id(value)][1]
 
     def _parts(self, value: Any) -> Iterable[Any]:
-        """All that a value consists of."""
+        """All parts that determine a value."""
         if isinstance(value, FunctionType):
             return (_own(value), _used(value))
         if isinstance(value, CodeType):
@@ -134,9 +138,11 @@ class _Reader:
             return sorted(value.items(), key=self.text)
         if isinstance(value, (staticmethod, classmethod, property, cached_property)):
             return [getattr(value, name, None) for name in ("__func__", "fget", "fset", "func")]
-        if isinstance(value, (GetSetDescriptorType, MemberDescriptorType)):  # slots, and attributes of classes in C
+        # slots, and attributes of classes that are written in C
+        if isinstance(value, (GetSetDescriptorType, MemberDescriptorType)):
             return (value.__qualname__,)
-        pickler = copyreg.dispatch_table.get(type(value))  # comes first, as in pickle
+        # these functions take precedence, as in pickle
+        pickler = copyreg.dispatch_table.get(type(value))
         reduced = pickler(value) if pickler else value.__reduce_ex__(4)
         pickled = [reduced] if isinstance(reduced, str) else reduced
         parts = [list(part) if isinstance(part, Iterator) else part for part in pickled]
@@ -144,16 +150,17 @@ class _Reader:
 
 
 def _own(function: FunctionType) -> list[Any]:
-    """The code of a function, or its name if it is that of a library, and its defaults."""
+    """Code of a function, or its name if it belongs to a library, and its defaults."""
     module = str(function.__globals__.get("__name__"))
     code = f"{module}.{function.__code__.co_qualname}" if _is_library(module) else function.__code__
     return [code, function.__defaults__, function.__kwdefaults__]
 
 
 def _used(function: FunctionType) -> dict[str, Any]:
-    """The values that a function closes over and those of the global names that it mentions."""
+    """Values that a function closes over, and values of the global names that it mentions."""
     cells = zip(function.__code__.co_freevars, function.__closure__ or ())
-    found = {name: None if cell == CellType() else cell.cell_contents for name, cell in cells}  # None if not assigned
+    # None if the variable is not assigned
+    found = {name: None if cell == CellType() else cell.cell_contents for name, cell in cells}
     scope, mentioned = function.__globals__, _names(function.__code__)
     for name in () if _is_library(str(scope.get("__name__"))) else sorted(mentioned & set(scope)):
         value = scope[name]
@@ -165,14 +172,14 @@ def _used(function: FunctionType) -> dict[str, Any]:
 
 
 def _names(code: CodeType) -> set[str]:
-    """All names that code mentions, also in inner functions."""
+    """All names that a code object mentions, including those of inner functions."""
     inner = [_names(one) for one in code.co_consts if isinstance(one, CodeType)]
     return set(code.co_names).union(*inner)
 
 
 def _parts_of_code(code: CodeType) -> tuple[Any, ...]:
     constants = code.co_consts
-    # the docstring of a function is its first constant, which is None without one
+    # the first constant of a function is its docstring, or None if it has no docstring
     if constants and isinstance(constants[0], str) and code.co_name not in ("<lambda>", "<module>"):
         constants = (None, *constants[1:])
     counts = (code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount, code.co_flags)
@@ -181,7 +188,7 @@ def _parts_of_code(code: CodeType) -> tuple[Any, ...]:
 
 
 def _parts_of_name(value: type | ModuleType) -> tuple[Any, ...]:
-    """The name of a class or a module, and of a class of the user its bases and its members without
+    """Name of a class or a module. For a class of the user also its bases and its members, without
     those that Python adds.
     """
     if isinstance(value, ModuleType) or _is_library(value.__module__):
@@ -195,7 +202,7 @@ def _parts_of_name(value: type | ModuleType) -> tuple[Any, ...]:
 
 
 def _is_library(module: str) -> bool:
-    """Whether a module belongs to the standard library or to an installed package."""
+    """True if a module belongs to the standard library or to an installed package."""
     top = module.partition(".")[0]
     file = getattr(sys.modules.get(module), "__file__", None) or ""
     installed = "site-packages" in file or "dist-packages" in file
@@ -203,7 +210,7 @@ def _is_library(module: str) -> bool:
 
 
 def _content(x: Tensor | np.ndarray) -> bytes:
-    """The bytes of all numbers."""
+    """Bytes of all numbers of an array."""
     if isinstance(x, Tensor):
         plain = x.detach().cpu().resolve_conj().resolve_neg().contiguous().reshape(-1)
         return plain.view(torch.uint8).numpy().tobytes() if plain.numel() else b""

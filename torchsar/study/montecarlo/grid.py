@@ -16,9 +16,10 @@ from torchsar.io.seal import address, canonical
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.settings.text import fault_of_name
 
-# names of dims and parts of results
+# names that dimensions and parts of results already have
 RESERVED = ("algorithm", "trial", "method", "ok", "outcome", "done", "saved")
-_LONGEST = 200  # bytes: file systems allow 255, and names of bounds and figures are longer
+# in bytes; file systems allow 255, and names of bounds and figures are longer than those of metrics
+_LONGEST = 200
 
 
 @dataclass(frozen=True)
@@ -29,8 +30,8 @@ class Parameter:
         name: Name of the parameter.
         labels: Numbers or words that name the values in results.
         values: The values that are passed to the trial function.
-        batched: Whether the trial function gets the values as a tensor with one entry per trial of
-            a batch, so that a batch may hold several values; otherwise all trials of a batch have
+        batched: True if the trial function gets the values as a tensor with one entry per trial of
+            a batch, so that a batch may hold several values. Otherwise all trials of a batch have
             the same value.
     """
 
@@ -52,7 +53,9 @@ class Point:
 
 @dataclass(frozen=True)
 class Case:
-    """Points of the grid whose trials may share a batch: only their batched parameters differ."""
+    """Points of the grid whose trials may be in one batch, because only their batched parameters
+    differ.
+    """
 
     fixed: Mapping[str, Any]
     points: tuple[Point, ...]
@@ -145,7 +148,7 @@ def check_name(name: Any, taken: Sequence[str], where: str, kind: str) -> None:
 
 
 def _bare(value: Any) -> Any:
-    """A number of numpy or torch as Python's own."""
+    """Convert a number of numpy or torch to one of Python."""
     return value.tolist() if hasattr(value, "tolist") and getattr(value, "ndim", 1) == 0 else value
 
 

@@ -30,13 +30,14 @@ from torchsar.study.output.report import installed_version
 from torchsar.study.settings.errors import ConfigError, did_you_mean
 
 log = logging.getLogger("torchsar")
-# trials after which points are checked first; intervals of fewer trials are too uncertain
+# number of trials after which points are first checked; confidence intervals of fewer trials are
+# too uncertain
 FIRST_LOOK = 50
 SWEEP_FILES = ("config.yaml", "summary.json", "figures", "report.html")
 
 
 class Interrupted(KeyboardInterrupt):
-    """Stopped by the user; what had been computed is recorded."""
+    """The user stopped the sweep. All results computed so far are recorded."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,7 @@ def looks(trials: int, stop: Stop | None) -> list[int]:
 
 @dataclass(frozen=True)
 class Plan:
-    """What a sweep computes.
+    """Settings of the computations of a sweep.
 
     Args:
         grid: The points, which are combinations of values of the parameters.
@@ -130,7 +131,7 @@ class Plan:
             raise ConfigError(f"sweep: the device {self.device!r} cannot be used here: {reason}")
 
     def work(self, trial: Trial) -> Work:
-        """What a process needs to compute its chunks."""
+        """Return all data that a process needs to compute its chunks."""
         return Work(trial, self.grid, Draws(self.seed, source=self.random), self.device, self.save)
 
     def refuse_missing(self, trial: Trial) -> None:
@@ -216,9 +217,9 @@ def sweep(
         The results, with the dims (algorithm, *parameters, trial).
 
     Raises:
-        ConfigError: If an argument is invalid, the trial function fails, or, with `out` and without
-            `version`, it uses a value that cannot be compared with that of a later run, such as an
-            open file or a lock.
+        ConfigError: If an argument is invalid or the trial function fails. Also, with `out` and
+            without `version`, if the trial function uses a value that cannot be compared with that
+            of a later run, such as an open file or a lock.
         Interrupted: After Ctrl-C; finished trials are recorded in `out`, if that is given.
     """
     for name, good, expected, given in (
@@ -246,8 +247,9 @@ def sweep(
 
 
 def identity_of_draws(seed: int, random: Source) -> dict[str, Any]:
-    """Return what the random numbers of a sweep depend on besides their addresses. Sweeps that were
-    recorded before there were other sources than numpy go on with it.
+    """Return the values besides their addresses on which the random numbers of a sweep depend.
+
+    Sweeps that were recorded when numpy was the only source continue with it.
     """
     return {"seed": seed, **({} if random == "numpy" else {"random": random})}
 
@@ -315,7 +317,9 @@ class _Run:
         self.known = int(record.done.sum())
 
     def _written(self) -> int:
-        """Number of trials written since the last call, or computed if there is no store."""
+        """Number of trials written since the last call; without a store, the number of computed
+        ones.
+        """
         before, waiting = self.known, 0 if self.store is None else self.store.waiting
         self.known = int(self.record.done.sum()) - waiting
         return self.known - before
@@ -353,19 +357,21 @@ class _Run:
             )
 
     def _tasks(self, first: int, last: int, workers: int) -> Iterator[Task]:
-        """Chunks of one level without the rows that are done."""
+        """Generate the chunks of one level, without the rows that are already computed."""
         done, level = self.record.done, slice(first, last)
         waiting = [
             number
             for number, (at, active) in enumerate(zip(self.points, self.active))
             if not all(done[(*at[p], level)].all() for p in active)
         ]
-        # all found before the first batch, since workers of a GPU hold its memory from then on
+        # all batch sizes are found before the first batch, because workers of a GPU hold its memory
+        # from then on
         for number in set(waiting) - set(self.rows):
             self.rows[number] = self.plan.chunk or rows_of(self.work, number, self.plan.trials, workers)
         for number in waiting:
             at, rows = self.points[number], self.rows[number]
-            if torch.device(self.plan.device).type == "cuda":  # a part for each process
+            # each process gets a part of the memory
+            if torch.device(self.plan.device).type == "cuda":
                 rows = min(rows, -(-(last - first) * len(self.active[number]) // workers))
             for whole in cut(number, self.work.cases[number], self.active[number], first, last, rows):
                 missing = [(p, t) for p, t in zip(whole.points, whole.trials) if not done[(*at[p], t)]]
@@ -374,10 +380,10 @@ class _Run:
                     yield Chunk(number, points, trials), self.fits.get(number)
 
     def _enter(self, chunk: Chunk, computed: Computed) -> None:
-        """Enter a chunk into the record and the store, which writes when that is cheap.
+        """Enter a chunk into the record and the store, which decides when to write.
 
-        The store is informed first: an interrupt in between may then leave rows that are announced
-        and not done, never the reverse.
+        The store is informed first. An interrupt in between may then leave rows that are announced
+        and not done, but never the reverse.
         """
         for text in computed.warnings:
             if text not in self.warned:
@@ -400,12 +406,12 @@ class _Run:
             self.store.flush()
 
     def flush(self) -> None:
-        """Write what the store has not written."""
+        """Write all results that the store has not written yet."""
         if self.store is not None:
             self.store.flush()
 
     def _drop_settled(self, trials: int) -> int:
-        """End the points that meet the criterion after `trials` trials; returns how many."""
+        """End the points that meet the criterion after `trials` trials, and return their number."""
         stop, before = self.plan.stop, sum(map(len, self.active))
         for points, active in zip(self.points, self.active):
             ended = {p for p in active if stop and stop.reached(self.record, points[p], trials, self.plan.seed)}

@@ -1,5 +1,5 @@
-"""Results of a sweep in memory, as labelled arrays with trials last, their comparison and their
-statistics, which reports show and summary.json holds.
+"""Results of a sweep in memory, as labelled arrays with trials last. Their comparison, and their
+statistics, which reports show and summary.json contains.
 """
 
 from __future__ import annotations
@@ -50,12 +50,12 @@ class Record(show.Shown):
 
     @property
     def ok(self) -> np.ndarray:
-        """Whether each trial is ok or was not assessed, bool (algorithm, *parameters, trial)."""
+        """True where a trial is ok or was not assessed, bool (algorithm, *parameters, trial)."""
         return self.outcome < Outcome.INEXACT
 
     @property
     def trials(self) -> int:
-        """Length of the trial dim."""
+        """Length of the trial dimension."""
         return self.done.shape[-1]
 
     @property
@@ -69,17 +69,18 @@ class Record(show.Shown):
         return blank(self.outcome.shape if by_algorithm else self.done.shape, float)
 
     def index_of(self, labels: Mapping[str, float | str]) -> tuple[int, ...]:
-        """Index of a point, from its labels by parameter."""
+        """Index of a point with given labels of the parameters."""
         return tuple(known.index(labels[name]) for name, known in self.labels.items())
 
     def labels_at(self, point: tuple[int, ...]) -> dict[str, float | str]:
-        """The labels of a point by parameter."""
+        """Labels of a point, by parameter."""
         return {name: known[i] for (name, known), i in zip(self.labels.items(), point)}
 
     def checksum(self, point: tuple[int, ...]) -> str:
-        """Checksum of all numbers of the trials that are done at a point."""
+        """Checksum of all numbers of the computed trials of a point."""
         rows = {name: x[(..., *point, self.done[point])] for name, (x, _, _) in self.variables().items()}
-        # a metric that the trials of a point do not have may become known later
+        # metrics that the trials of a point do not have are left out, because they may be added
+        # later
         return checksum({name: x for name, x in rows.items() if x.dtype != float or not np.isnan(x).all()})
 
     def add(
@@ -127,7 +128,9 @@ class Record(show.Shown):
         self.done.reshape(-1)[rows] = True
 
     def _array(self, known: dict[str, np.ndarray], name: str, stored: str) -> np.ndarray:
-        """A known array, or a new one, whose name in the store must not be that of another one."""
+        """Return a known array, or a new one. The name of a new one in the store must differ from
+        those of all others.
+        """
         if name not in known:
             kind = "metric" if known is self.metrics else "bound"
             check_name(stored, (*RESERVED, *self.labels, *self.variables()), "the trial function", kind)
@@ -387,7 +390,10 @@ def _shares(hits: np.ndarray, of: np.ndarray, name: str) -> dict[str, np.ndarray
 
 
 def _success(record: Record, values: np.ndarray, limit: float | None) -> dict[str, np.ndarray]:
-    """Nothing without a limit; an algorithm without the metric neither succeeds nor fails."""
+    """Share of trials whose metric is within a limit, with its interval; nothing without a limit.
+
+    Trials of an algorithm without the metric count neither as success nor as failure.
+    """
     if limit is None:
         return {}
     here = np.isfinite(values)

@@ -20,7 +20,7 @@ from torchsar.study.output.numbers import MISSING, number
 from torchsar.study.output.progress import clock
 from torchsar.study.output.report import Drawn, Picture, draw_all, write_page
 
-# parts of `about` that are shown elsewhere in the report, or are too long for it
+# parts of `about` that the report shows elsewhere, or that are too long for it
 _NOT_SHOWN = ("title", "config", "identity", "sessions", "chunk_rows")
 
 
@@ -98,7 +98,7 @@ def _row(point: Mapping[str, Any]) -> list[str]:
 
 
 def outcome_tables(tree: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """One table of the outcomes of each algorithm at every point, if there are any."""
+    """Table of the outcomes of each algorithm at every point, if there are any."""
     rows = [
         [
             *(point["algorithm"], *map(label_text, point["parameters"].values()), f"{point['trials']}"),
@@ -113,7 +113,7 @@ def outcome_tables(tree: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def bound_tables(tree: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """One table of all bounds, if there are any."""
+    """Table of all bounds, if there are any."""
     rows = [
         [b["bound"], axis_label(b["metric"]), *map(label_text, b["parameters"].values()), number(b["rms"])]
         for b in tree["bounds"]
@@ -133,12 +133,12 @@ def origin(about: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
                 yield before + name.replace("_", " "), number(value) if isinstance(value, float) else inner
 
 
-# more panels in one figure are too small to read
+# largest number of panels of a figure; more would be too small to read
 PANELS = 6
 
 
 def label_text(label: float | str) -> str:
-    """A value of a parameter as results show it."""
+    """Text of a value of a parameter, as in the results."""
     return label if isinstance(label, str) else f"{label:g}"
 
 
@@ -206,7 +206,7 @@ class SweepPictures:
         return np.arange(len(labels)) if isinstance(labels[0], str) else np.argsort(np.asarray(labels, dtype=float))
 
     def sorted_labels(self, name: str) -> list[Any]:
-        """The values of a parameter in the order in which they are drawn."""
+        """Values of a parameter in the order in which they are drawn."""
         return [self.labels[name][i] for i in self.order(name)]
 
     def cut(self, array: np.ndarray, panel: Panel, over: str, lead: int = 1) -> np.ndarray:
@@ -328,7 +328,7 @@ class SweepPictures:
         return panels, "".join(thinned) + (f" Throughout: {self._texts(self.fixed)}." if self.fixed else "")
 
     def _texts(self, index: Mapping[str, int]) -> str:
-        """Values of parameters, for reading: 'squint 3 deg, scene: point'."""
+        """Values of parameters as text for readers, such as 'squint 3 deg, scene: point'."""
         known = [(*name_and_unit(name), self.labels[name][i]) for name, i in index.items()]
         texts = (
             f"{words}: {x}" if isinstance(x, str) else f"{words} {x:g} {unit}".rstrip() for words, unit, x in known
@@ -356,7 +356,7 @@ class SweepPictures:
         return " ".join(text for text, applies in sentences.items() if applies)
 
     def trials(self, metric: str) -> str:
-        """The number of trials of a point, or its range."""
+        """Number of trials per point, or its range."""
         done = self.figures[metric]["trials"]
         few, many = int(done.min()), int(done.max())
         return f"{many} trials a point" if few == many else f"{few} to {many} trials a point"
@@ -413,7 +413,7 @@ def _capital(text: str) -> str:
 
 
 def _paged(panels: Sequence[Panel], size: int) -> Iterator[tuple[str, Sequence[Panel]]]:
-    """The panels of each page, with the end of its title."""
+    """Generate the panels of each page, with the end of the title of the page."""
     count = -(-len(panels) // size)
     for page in range(count):
         yield f" ({page + 1} of {count})" if count > 1 else "", panels[page * size : (page + 1) * size]

@@ -30,9 +30,10 @@ from torchsar.study.montecarlo.grid import Grid
 from torchsar.study.montecarlo.record import OUTCOME, Labels, Record, blank
 from torchsar.study.settings.errors import ConfigError, one_line
 
-# number of the layout of the store; another one is refused on resume
+# version of the layout of the store; other versions are rejected on resume
 FORMAT = 3
-# trials whose arrays wait to be written at most, since they fill the memory meanwhile
+# largest number of trials whose saved arrays wait to be written, because they fill the memory
+# meanwhile
 _WAITING = 64
 _DONE, _SAVED = "done", "saved"
 
@@ -92,7 +93,9 @@ class Store:
         values = {name: {**known.get(name, {}), **named} for name, named in _values(grid).items()}
         about = {"format": FORMAT, "identity": _plain(identity), "hash": address(identity), "values": values}
         labels = {name: list(known) for name, known in self.record.labels.items()}
-        if self._marks["points"]:  # with the present shapes, which an earlier session may have left half grown
+        # the arrays have their present shapes, which an earlier session may have enlarged only in
+        # part
+        if self._marks["points"]:
             self._mark()
         self.note(**about, labels=labels, trials=self.record.trials)
         self._put_coordinates()
@@ -114,8 +117,8 @@ class Store:
         of this time, later if it takes more than 10 %, or if the saved arrays of 64 trials wait to
         be written.
         """
-        # results are written every so many seconds, or more often if writing takes half a percent
-        # of the time at most, and less often if it would take a tenth
+        # The interval in seconds between writes is 4 s. It is shorter if writing then takes at most
+        # half a percent of the time, and longer if writing would take more than a tenth.
         interval = max(min(self._cost / 0.005, 4.0), self._cost / 0.1)
         return time.perf_counter() - self._last > interval or len(self._pending) >= _WAITING
 
@@ -176,8 +179,8 @@ class Store:
         self.root[_DONE].update_attributes(sealed(self._marks))
 
     def _write(self, name: str, variable: tuple[np.ndarray, Any, Any], first: int, last: int) -> None:
-        """The trials first..last-1 of all points, widened to whole chunks of the array, so that
-        nothing is read back.
+        """Write the trials first..last-1 of all points. The range is widened to whole chunks of the
+        array, so that nothing has to be read back.
         """
         array, data = self._array(name, *variable), variable[0]
         step = array.chunks[-1]
@@ -185,13 +188,13 @@ class Store:
         array[window] = data[window]
 
     def _array(self, name: str, data: np.ndarray, dims: tuple[str, ...], about: dict[str, Any]) -> zarr.Array:
-        """The array of that name, made or enlarged as needed; cached, since looking it up takes as
-        long as writing it.
+        """Return the array of a name, created or enlarged as needed. It is cached, because finding
+        it takes as long as writing it.
         """
         if name not in self._arrays:
             leading = tuple(max(1, min(n, 64)) for n in data.shape[:-1])
-            # numbers in a zarr chunk at most: half a megabyte, which is written whole for every
-            # change
+            # largest number of values in a zarr chunk: half a megabyte, which is rewritten as a
+            # whole for every change
             chunk = max(1, min(data.shape[-1], 1024, (1 << 16) // max(1, int(np.prod(leading)))))
             made: dict[str, Any] = {
                 "shape": data.shape,
@@ -209,7 +212,9 @@ class Store:
         return self._arrays[name]
 
     def _put_coordinates(self) -> None:
-        """Write the coordinates whole. Those that exist grow, and are never removed meanwhile."""
+        """Write the coordinates as a whole. Existing ones are enlarged and never removed in
+        between.
+        """
         for name, values in ((name, np.array(values)) for name, values in _coordinates(self.record).items()):
             known: Any = self.root.get(name)
             dtype: Any = values.dtype
@@ -217,7 +222,7 @@ class Store:
                 dtype, values = str, values.astype(getattr(np.dtypes, "StringDType", lambda: object)())
             made: dict[str, Any] = {"shape": values.shape, "dtype": dtype, "chunks": values.shape}
             with warnings.catch_warnings():
-                # zarr warns that texts are not in version 3 of the specification yet
+                # zarr warns that version 3 of its specification does not contain texts yet
                 warnings.simplefilter("ignore")
                 known = known or self.root.create_array(
                     name, dimension_names=(name,), compressors=[Crc32cCodec()], **made
@@ -291,7 +296,7 @@ def _opened(path: Path, mode: Any, needed: Collection[str] = ("labels", "identit
 
 @contextmanager
 def _undamaged(path: Path) -> Iterator[None]:
-    """Turn an error of a file that is missing or damaged into one sentence."""
+    """Convert an error due to a missing or damaged file to one sentence."""
     try:
         yield
     except Exception as error:  # zarr raises errors of many kinds
@@ -303,7 +308,7 @@ def _undamaged(path: Path) -> Iterator[None]:
 
 @contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """Turn an error of the file system into one sentence."""
+    """Convert an error of the file system to one sentence."""
     try:
         yield
     except OSError as error:
@@ -314,7 +319,7 @@ def _writing(path: Path) -> Iterator[None]:
 
 
 def _loaded(root: zarr.Group, path: Path) -> Record:
-    """The trials on disk that are marked done.
+    """Read the trials on disk that are marked as done.
 
     Raises:
         ConfigError: If files are missing or damaged.
@@ -330,7 +335,7 @@ def _loaded(root: zarr.Group, path: Path) -> Record:
         whole = coordinates | {name: variable[0] for name, variable in record.variables().items()}
         for name, (known, rest) in marks["arrays"].items():
             shape, now = array_metadata(path / name)
-            # an array has its earlier shape where the sweep was killed while its arrays grew
+            # an array has its earlier shape if the sweep was killed while its arrays were enlarged
             if now != rest or shape not in (known, list(whole[name].shape)):
                 raise ValueError(f"the metadata of {name!r} differ from their checksum")
             array: Any = root[name]
@@ -360,7 +365,7 @@ def _read(root: zarr.Group, held: Mapping[str, Any], marks: Mapping[str, Any]) -
             target = record.metrics.setdefault(name, record.blank())
         else:
             target = record.bounds.setdefault(about["bound_of"], {}).setdefault(about["bound"], record.blank(False))
-        # the array is smaller where the sweep was killed while its arrays grew
+        # the array is smaller if the sweep was killed while its arrays were enlarged
         part = tuple(map(slice, array.shape))
         target[part] = np.where(record.done[part[-record.done.ndim :]], np.asarray(array[...]), target[part])
     wrong = next((point for index, point in points.items() if marks[index][SEAL] != record.checksum(point)), None)
@@ -376,7 +381,7 @@ def _coordinates(record: Record) -> dict[str, Sequence[Any]]:
 
 
 def _of_saved(path: Path, place: str, arrays: Mapping[str, np.ndarray]) -> str:
-    """The checksum of the saved arrays of a trial with the metadata of their groups."""
+    """Checksum of the saved arrays of a trial and of the metadata of their groups."""
     folder = path / _SAVED / place
     groups = (folder.parents[1], folder.parent, folder, *(folder / name for name in sorted(arrays)))
     return checksum(arrays, [document(group) for group in groups])
@@ -392,7 +397,7 @@ def _about(root: zarr.Group) -> dict[str, Any]:
 
 
 def _spans(done: np.ndarray) -> list[list[int]]:
-    """Ranges [first, last) of a row of flags."""
+    """Ranges [first, last) in which a row of flags is True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], done, [False]]).astype(np.int8)))
     return edges.reshape(-1, 2).tolist()
 
@@ -400,7 +405,9 @@ def _spans(done: np.ndarray) -> list[list[int]]:
 def _refuse_another(
     path: Path, held: Mapping[str, Any], identity: Mapping[str, Any], values: Mapping[str, Any]
 ) -> None:
-    """Refuse to mix the results of two configs; the sentence names what differs."""
+    """Raise ConfigError if the store contains results of another config; the sentence names the
+    differences.
+    """
     was = held["values"]
     if list(was) != list(values):
         raise ConfigError(
@@ -440,7 +447,7 @@ def _short(value: Any) -> str:
 
 
 def _values(grid: Grid) -> dict[str, dict[str, str]]:
-    """The text of every value by parameter and label."""
+    """Text of every value, by parameter and label."""
     return {p.name: {str(label): canonical(value) for label, value in zip(p.labels, p.values)} for p in grid.parameters}
 
 

@@ -23,12 +23,13 @@ from torchsar.study.montecarlo.grid import Case, Grid
 from torchsar.study.montecarlo.record import OK, OUTCOME
 from torchsar.study.settings.errors import ConfigError, one_line
 
-# Larger batches take more time per trial for want of cache, but batches of fewer than four trials
-# 10 to 25 % more for the calls, as measured with sweeps of four systems.
+# Larger batches take more time per trial, because they do not fit into the cache. Batches of fewer
+# than four trials take 10 to 25 % more time for the calls, as measured with sweeps of four systems.
 CACHE_BYTES = 12 << 20
-# Share of the free memory of a GPU that a batch takes (with 0.9, gaps between tensors left no room
-# in two of four sweeps), ratio of the sizes of batches whose memory is measured one after the
-# other, and memory that a process takes for itself.
+# _GPU_SHARE: share of the free memory of a GPU that a batch takes. With 0.9, gaps between tensors
+# left no room in two of four sweeps.
+# _LARGER: ratio of the sizes of batches whose memory is measured one after the other.
+# _CONTEXT_BYTES: memory that a process takes for itself.
 _GPU_SHARE, _LARGER, _CONTEXT_BYTES = 0.8, 8, 600 << 20
 
 
@@ -97,7 +98,7 @@ def rows_by_trial(run: Callable[[int], int | None], device: torch.device | str, 
     share, peaks = -(-trials // workers), list[tuple[int, int]]()
     if share < 2:
         return 1
-    run(1)  # makes what later batches find made
+    run(1)  # this run makes objects that later batches reuse
     rows = 1
     while True:
         with PeakMemory(device) as memory:
@@ -115,7 +116,7 @@ def rows_by_trial(run: Callable[[int], int | None], device: torch.device | str, 
 
 
 def _room_bytes(device: torch.device | str, workers: int) -> int:
-    """Memory that a batch of each of the processes that share a device may take."""
+    """Memory in bytes that a batch may take in each of the processes that use a device."""
     torch.cuda.empty_cache()
     free, _ = torch.cuda.mem_get_info(device)
     sharing = workers if torch.device(device).index is not None else -(-workers // torch.cuda.device_count())
@@ -188,7 +189,7 @@ class Computed:
 
 @dataclass(frozen=True)
 class Work:
-    """All that a process needs to compute chunks."""
+    """All data that a process needs to compute chunks."""
 
     trial: Trial
     grid: Grid
@@ -221,7 +222,9 @@ class Work:
         return Computed(parts, found if found != fits else None, tuple(dict.fromkeys(said)))
 
     def _refuse_unless_halving_helps(self, chunk: Chunk, error: Exception) -> None:
-        """Raise a ConfigError unless a batch of several trials did not fit into memory."""
+        """Raise a ConfigError, unless the error is that a batch of several trials did not fit into
+        memory.
+        """
         points = ", ".join(f"{k}={v}" for k, v in self.cases[chunk.case].fixed.items()) or "the sweep"
         where = f"trials {min(chunk.trials)} to {max(chunk.trials)} of {points} failed"
         if not is_out_of_memory(error):
@@ -311,7 +314,7 @@ def _nested(tree: Any) -> bool:
 
 
 def _array(value: Any, row: int, rows: int, what: str) -> np.ndarray:
-    """One trial of an array that is kept."""
+    """One trial of an array that is saved."""
     if not hasattr(value, "__len__") or len(value) != rows:
         raise ValueError(
             f"{what} must hold one array for each of the {rows} trials, got "
@@ -324,7 +327,7 @@ def _array(value: Any, row: int, rows: int, what: str) -> np.ndarray:
 
 
 def _numbers(tree: Mapping[str, Mapping[str, Any]], rows: int, before: str = "") -> Numbers:
-    """Plain numbers for each row: lists, the fastest conversion from torch."""
+    """Plain numbers for each row, as lists, which is the fastest conversion from torch."""
     return {
         outer: {inner: _rows(value, rows, f"{before}{outer}.{inner}") for inner, value in named.items()}
         for outer, named in tree.items()
@@ -360,7 +363,8 @@ def probed_bytes(work: Work, case: int) -> int:
 
 
 def rows_of(work: Work, case: int, trials: int, workers: int) -> int:
-    """Return the largest number of trials in a batch: on a CPU by its cache, on a GPU what fits.
+    """Return the largest number of trials in a batch: on a CPU it follows from the cache, on a GPU
+    from the memory.
 
     Args:
         work: The work.

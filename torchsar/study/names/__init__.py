@@ -1,1 +1,1 @@
-"""What a config may name: stages, scenes, motions, impairments and the like."""
+"""Names that a config may use: stages, scenes, motions, impairments and the like."""

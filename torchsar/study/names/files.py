@@ -18,9 +18,9 @@ def measured_track(file: str) -> MeasuredTrack:
     """Measured displacement at equally spaced times, interpolated by a cubic spline.
 
     Args:
-        file: Text or .csv file of two columns, times in seconds and displacements in metres
-            (separated by commas or blanks, a line of names is allowed), .npy file of shape (n, 2),
-            or .npz file with `time_s` (n,) and `displacement_m` (..., n).
+        file: Text or .csv file of two columns, times in seconds and displacements in metres. They
+            are separated by commas or blanks, and a line of names is allowed. Or .npy file of shape
+            (n, 2), or .npz file with `time_s` (n,) and `displacement_m` (..., n).
     """
     time_s, displacement_m = (torch.as_tensor(x, dtype=torch.float64) for x in measured_displacement(file))
     try:
@@ -139,7 +139,7 @@ def point_cloud(
 
 
 def _read(read: Callable[..., Any], file: str, *keys: Any) -> Any:
-    """What a function reads from a file; ValueError if it cannot."""
+    """Content that a function reads from a file. Raises ValueError if the file cannot be read."""
     try:
         return read(file, *keys)
     except OSError as error:

@@ -1,10 +1,9 @@
 """Every name that a config may use for stages and for parts of a world, such as scenes and motions.
 
 A name is that of the class or function in snake case: `CorrectPulsePhase` is `correct_pulse_phase`.
-Stages are the public ones of the packages of stages, as far as a config can hold what they need,
-and the functions below that build further ones. A package of the user adds a stage by an
-entry point of the group `torchsar.stages` (name = "package.module:Class"). A config has no other
-way to run code.
+Stages are the public ones of the packages of stages, if a config can represent all that they need,
+and those that the functions below build. A package of the user adds a stage by an entry point of
+the group `torchsar.stages` (name = "package.module:Class"). A config has no other way to run code.
 """
 
 from __future__ import annotations
@@ -450,7 +449,7 @@ def path_error(x: AntennaMotions = (), y: AntennaMotions = (), z: AntennaMotions
 
 PATH_IMPAIRMENTS = Catalogue("impairment of a recording along any path", "kind", (*_OF_TARGETS, path_error))
 LADAR_IMPAIRMENTS = Catalogue("impairment of a ladar recording", "kind", (echo.Quantiser, *_OF_RECEIVERS))
-# what `torchsar list` shows besides stages, by the section of the world that names it
+# parts that `torchsar list` shows besides stages, by the section of the world that names them
 WORLD = {
     "SCENES (world.scene)": SCENES,
     "BEAMS (stripmap: world.beam)": BEAMS,
@@ -476,9 +475,9 @@ WORLD = {
     "IMPAIRMENTS (geo, geo_ocean)": MULTICHANNEL_IMPAIRMENTS,
 }
 
-# the bases of other stages, and what gives no signal
+# base classes of other stages, and stages whose result is no signal
 _NO_STAGES = ("path_image", "image_movers")
-# stages that a function builds from plain keys, by the package where they are listed
+# stages that functions build from plain keys, by the package where they are listed
 _BUILT = {
     "repair": (),
     "compensate": (autofocus, effective_velocity, rotation_and_phase),
@@ -486,7 +485,7 @@ _BUILT = {
     "focus": (padded_lines,),
     "metrics": (measure,),
 }
-# keys of stages that choose a form, and that may be left to choose
+# keys of stages that may be `auto`
 _AUTOMATIC = (
     "correct_migration.migration",
     "remove_transmit_range.order",
@@ -498,7 +497,7 @@ _GIVEN = ("radar", "geometry", "side_data", "expected_power")
 
 
 def _public(package: Any) -> dict[str, Callable[..., Any]]:
-    """The public stages of a package, by name."""
+    """Public stages of a package, by name."""
     classes = (getattr(package, name) for name in package.__all__)
     found = {snake(one.__name__): one for one in classes if isinstance(one, type) and issubclass(one, Stage)}
     return {name: one for name, one in found.items() if name not in _NO_STAGES and Section(one, _GIVEN).is_complete}
@@ -526,7 +525,8 @@ def stages() -> Catalogue:
             if point.name in entries:
                 raise ValueError(f"the stage name {point.name!r} is in use; rename it")
             entries[point.name] = point.load()
-            assert Section(entries[point.name], _GIVEN).keys is not None  # its parameters can be read
+            # fails unless the parameters of the stage can be read
+            assert Section(entries[point.name], _GIVEN).keys is not None
     return Catalogue("stage", "stage", entries, given=_GIVEN, automatic=_AUTOMATIC)
 
 

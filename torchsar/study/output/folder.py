@@ -26,12 +26,13 @@ from torchsar.study.settings.errors import ConfigError
 
 try:
     import fcntl
-except ImportError:  # not available on every operating system; there is then no lock
+# the module does not exist on every operating system, and without it there is no lock
+except ImportError:
     fcntl = None
 
 log = logging.getLogger("torchsar")
 STATE = ".torchsar"
-# files whose presence means that a result is complete: they are removed first and moved last
+# files whose presence means that a result is complete; they are removed first and moved last
 _LAST = ("report.html", "metrics.json", "summary.json", "trade.json", "requires.json")
 
 
@@ -82,7 +83,7 @@ class ResultFolder:
 
     @property
     def claimed(self) -> bool:
-        """Whether the folder is reserved for, or holds, a result of this kind."""
+        """True if the folder is reserved for, or holds, a result of this kind."""
         return self._manifest()["kind"] == self.kind
 
     def claim(self) -> None:
@@ -136,8 +137,10 @@ class ResultFolder:
         shutil.rmtree(new, ignore_errors=True)
 
     def _manifest(self) -> dict[str, Any]:
-        """`kind` of the result, `files`, which is the print of each file by path, and `old`, which
-        is that of an earlier result while it is replaced, or None.
+        """Content of the manifest: `kind` of the result; `files`, the print of each file by path;
+        and `old`.
+
+        `old` contains the prints of an earlier result while it is replaced, and is None otherwise.
         """
         path = self.path / STATE / "manifest.json"
         if path.exists() and not path.is_file():
@@ -168,7 +171,7 @@ class ResultFolder:
         )
 
     def _note(self, **changes: Any) -> None:
-        """Replace entries of the manifest; the file changes as a whole."""
+        """Replace entries of the manifest. The file is replaced as a whole."""
         path = self.path / STATE / "manifest.json"
         part = path.with_name("manifest.json.part")
         part.write_text(json.dumps(sealed({**self._manifest(), **changes})), encoding="utf-8")
@@ -214,7 +217,7 @@ def fresh_result(out: Path, kind: str, names: Sequence[str]) -> Iterator[Path]:
     try:
         with opened(out, kind, names) as folder, folder.staged() as new:
             yield new
-    except BrokenPipeError:  # of stdout, not of the folder
+    except BrokenPipeError:  # the pipe of stdout was closed; the folder is intact
         raise
     except OSError as error:
         raise ConfigError(
@@ -224,7 +227,9 @@ def fresh_result(out: Path, kind: str, names: Sequence[str]) -> Iterator[Path]:
 
 
 def _locked(out: Path) -> Any:
-    """The locked file of a result folder; the operating system releases it with the process."""
+    """Lock a result folder and return the locked file. The operating system releases the lock when
+    the process ends.
+    """
     state = out / STATE
     for attempts_left in reversed(range(10_000)):
         try:
@@ -234,7 +239,7 @@ def _locked(out: Path) -> Any:
             file = (state / "lock").open("a")
         except (OSError, ValueError) as error:
             if isinstance(error, FileNotFoundError) and attempts_left:
-                continue  # another command may just have removed the empty folder
+                continue  # another command may have just removed the empty folder
             raise ConfigError(f"--out {str(out)!r} cannot be written: {error}; choose another folder") from None
         try:
             if fcntl is not None:
@@ -256,15 +261,18 @@ def _rank(name: str) -> tuple[int, str]:
 
 
 def _files(path: Path) -> list[Path]:
-    """The file itself, or all files below a folder; a symbolic link or a pipe counts as a file."""
+    """Return the path itself if it is a file, or all files below a folder. A symbolic link or a
+    pipe counts as a file.
+    """
     if path.is_symlink() or (path.exists() and not path.is_dir()):
         return [path]
     return sorted(p for p in path.rglob("*") if p.is_symlink() or not p.is_dir())
 
 
 def _print_of(path: Path) -> list[Any] | None:
-    """Size of a file and a digest of its content, without it above 4 MiB, whose reading would take
-    as long as a run; None for what is no file.
+    """Size of a file and digest of its content; None if the path is no file.
+
+    The digest is left out above 4 MiB, because reading would take as long as a run.
     """
     if path.is_symlink() or not path.is_file():
         return None

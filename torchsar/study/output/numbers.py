@@ -11,7 +11,7 @@ from typing import Any
 from torch import Tensor
 
 MISSING = "–"
-# units that have prefixes, unlike those of levels, ratios and angles in degrees
+# units that have prefixes; those of levels, ratios and angles in degrees have none
 _PREFIXED = ("m", "s", "Hz", "rad", "B")
 _PREFIXES = {-12: "p", -9: "n", -6: "u", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"}
 
@@ -58,7 +58,8 @@ def number(value: Any, sd: Any = None, factor: float = 1.0) -> str:
         sd = float(f"{sd * factor:.1e}")
         digits = 1 - math.floor(math.log10(sd))
         if digits < 10:
-            return " ± ".join(f"{round(x, digits) + 0.0:,.{max(0, digits)}f}" for x in (value, sd))  # + 0.0: no -0
+            # adding 0.0 converts -0 to 0
+            return " ± ".join(f"{round(x, digits) + 0.0:,.{max(0, digits)}f}" for x in (value, sd))
         return f"{value:.4g} ± {sd:.2g}"
     if float(value).is_integer() and abs(value) < 1e6:
         return f"{int(value)}"

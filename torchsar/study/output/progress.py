@@ -7,7 +7,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-# seconds between bars in a file, which gets at least one in 10 s
+# seconds between two bars in a file, so that it has at least one in 10 s
 _EVERY_S = 8.0
 
 

@@ -98,7 +98,7 @@ def run_fields(metrics: Mapping[str, Any], columns: Shown, target_columns: Shown
     best, cases = methods["recommended"], list(methods["recommended"]["cases"])
     shown = {key: column for key, column in columns.items() if best["metrics"].get(key) is not None}
     first = best["metrics"]
-    # largest number of metrics shown above the tables: two rows of four on a wide screen
+    # largest number of metrics above the tables: two rows of four on a wide screen
     tiles = [(quantity(first[key], c.unit, _sd(first, key)), c.label) for key, c in list(shown.items())[:8]]
     rows = {name: method["cases"] for name, method in methods.items()}
     published = metrics["published"]
@@ -140,7 +140,7 @@ def run_fields(metrics: Mapping[str, Any], columns: Shown, target_columns: Shown
 
 
 def _in_words(outcomes: str | list[str] | None) -> str:
-    """Names of outcomes, (trial,) or one, as words such as "noise: 2, ok: 1"."""
+    """Outcomes of the trials, or of one trial, in words such as "noise: 2, ok: 1"."""
     found = Counter([outcomes] if isinstance(outcomes, str) else outcomes)
     return (
         ", ".join(f"{Outcome[x].label}{f': {n}' if len(found) > 1 else ''}" for x, n in found.most_common()) or MISSING
@@ -152,7 +152,7 @@ def _row(name: str, cells: list[str], soft: bool = False) -> dict[str, Any]:
 
 
 def _sd(row: Mapping[str, Any], key: str) -> float | None:
-    """Standard deviation over trials; not of times, which depend on the load of the machine."""
+    """Standard deviation over trials; None for times, which depend on the load of the machine."""
     return None if key == "seconds" else row.get(f"{key}_sd")
 
 
@@ -161,7 +161,8 @@ def _cell(row: Mapping[str, Any], key: str, factor: float) -> str:
 
 
 def _tables(rows: Mapping[str, Any], columns: Shown, published: Mapping[str, Any], first: str) -> list[dict[str, Any]]:
-    """A table for each metric, with a row for each case or target and a column for each method.
+    """Make a table for each metric, with a row for each case or target and a column for each
+    method.
 
     Args:
         rows: Numbers by method, case or target, and metric.
@@ -185,7 +186,7 @@ def _tables(rows: Mapping[str, Any], columns: Shown, published: Mapping[str, Any
 
 
 def _one_table(rows: Mapping[str, Any], columns: Shown, published: Mapping[str, Any], case: str) -> dict[str, Any]:
-    """One table for one case, with a row for each metric and a column for each method."""
+    """Make the table of one case, with a row for each metric and a column for each method."""
     names, body = list(rows), []
     for key, column in columns.items():
         values = [rows[name][case].get(key) for name in names]
@@ -200,14 +201,14 @@ def _one_table(rows: Mapping[str, Any], columns: Shown, published: Mapping[str, 
 
 
 log = logging.getLogger("torchsar")
-# ratio of the largest and the least value above which a comparison has a logarithmic axis
+# ratio of the largest to the smallest value above which a comparison has a logarithmic axis
 _DECADES = 100.0
 Drawn = Iterator[tuple[str, str, str, Any]]
 
 
 @dataclass(frozen=True)
 class Picture:
-    """Figure files that are shown side by side, with their title and caption."""
+    """Files of a figure that are shown side by side, with their title and caption."""
 
     files: tuple[str, ...]
     title: str
@@ -239,10 +240,12 @@ def draw_all(makers: Iterable[Callable[[], Drawn]], folder: Path) -> list[Pictur
 
 
 def _drawn(make: Callable[[], Drawn]) -> Drawn:
-    """The pictures of one function, the last of which may say that the next one failed."""
+    """Generate the pictures of one function. If it fails, the last picture contains the error as
+    text.
+    """
     try:
         yield from make()
-    except OSError:  # of the disk
+    except OSError:  # errors of the disk
         raise
     except Exception as error:  # results are more important than their pictures
         text = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"

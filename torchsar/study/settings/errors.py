@@ -6,7 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from torchsar.spelling import did_you_mean as did_you_mean  # for all modules of `study`
+# imported here for all modules of `study`
+from torchsar.spelling import did_you_mean as did_you_mean
 
 
 class ConfigError(ValueError):
@@ -22,7 +23,9 @@ def one_line(error: BaseException) -> str:
 
 @contextmanager
 def loading(point: Any) -> Iterator[None]:
-    """Turn any error of loading an entry point of another package into one sentence."""
+    """Convert any error that occurs when an entry point of another package is loaded to one
+    sentence.
+    """
     try:
         yield
     except (Exception, SystemExit) as error:

@@ -14,11 +14,12 @@ from torchsar.study.settings.errors import ConfigError, did_you_mean
 from torchsar.study.settings.signature import Strict, sentence
 from torchsar.study.settings.text import dump, fault_of_name
 
-# prefix of the true values in configs of earlier versions
+# prefix of true values in configs of earlier versions
 _OLD_TRUTH = "aux.true_"
-# names of groups in the results, which methods and cases cannot have
+# names of groups in the results, which methods and cases must not have
 RESERVED = ("truth", "estimate")
-# bytes in the name of a method, a stage or a case at most: names of files hold all three
+# largest number of bytes in the name of a method, a stage or a case, because names of files contain
+# all three
 LONGEST_NAME = 60
 
 
@@ -47,7 +48,7 @@ class Rerun(Strict):
     given: dict[str, float]
 
 
-# keys of a stage that concern its connections in the chain, not its constructor
+# keys of a stage that describe its connections in the chain and are no arguments of its constructor
 OF_CHAIN = ("uses", "in_doubt")
 
 
@@ -226,7 +227,8 @@ class Loaded:
             ConfigError: If a key does not exist, a value is not accepted, or the system changes.
         """
         tree = self.config.model_dump()
-        for key, value in sorted(values.items(), key=lambda item: item[0].count(".")):  # sections before their parts
+        # a section is changed before its parts
+        for key, value in sorted(values.items(), key=lambda item: item[0].count(".")):
             if key == "system":
                 raise ConfigError(f"{self.file}: {where}: the key 'system' cannot be changed")
             tree = _placed(tree, key.split("."), value, f"{self.file}: {where}: the key {key!r}")
@@ -238,7 +240,9 @@ class Loaded:
 
 
 def _placed(tree: Any, path: list[str], value: Any, what: str) -> Any:
-    """The tree with one value changed; all parts of the path but the last must exist."""
+    """Return the tree with one value changed. All parts of the path except the last one
+    must exist.
+    """
     head, rest = path[0], path[1:]
     if isinstance(tree, list) and head.isdecimal() and int(head) < len(tree):
         index = int(head)
@@ -283,7 +287,7 @@ def checked(tree: Any, system: Any, file: str) -> Config:
 
 
 def _method(method: Method, where: str, system: Any, file: str) -> Method:
-    """The method with all keys of its stages."""
+    """Return the method with all keys of its stages."""
     stages = {}
     for name, entry in (method.stages or {}).items():
         uses = entry.get("uses", {})
@@ -346,8 +350,8 @@ def _check_reruns(methods: Mapping[str, Method], file: str) -> None:
 
 
 Magnitudes = Mapping[str, tuple[str, float, float]]
-# unit, least and largest magnitude of numbers other than zero, by the ending of their key; the
-# first ending that fits counts
+# Unit, least and largest magnitude of numbers other than zero, by the ending of their key. The
+# first ending that fits is used.
 MAGNITUDES: Magnitudes = {
     "wave_speed_m_s": ("m/s", 1e8, 3.1e8),
     "carrier_hz": ("Hz", 2e7, 1e16),
@@ -399,7 +403,9 @@ def refuse_implausible(magnitudes: Magnitudes, radar: Any, world: Any, file: str
 
 
 def _numbers(tree: Any, path: str) -> Iterator[tuple[str, float]]:
-    """Every number of a tree with its dotted key; entries of a list have the key of the list."""
+    """Generate every number of a tree with its dotted key. Entries of a list have the key of the
+    list.
+    """
     if isinstance(tree, Mapping):
         for key, value in tree.items():
             yield from _numbers(value, f"{path}.{key}".lstrip("."))
@@ -410,9 +416,9 @@ def _numbers(tree: Any, path: str) -> Iterator[tuple[str, float]]:
         yield path, tree
 
 
-# name of the only case of a config that lists none
+# name of the case of a config that lists no cases
 ALL = "all"
-# sections that are common to all cases
+# sections that all cases have in common
 _COMMON = ("title", "cases", "metrics", "trade", "sweep", "beyond_limits")
 
 

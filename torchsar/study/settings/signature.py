@@ -1,5 +1,7 @@
-"""Config sections from constructors: keys, types and defaults are those of their signatures, and
-errors of values are sentences.
+"""Config sections that follow from constructors.
+
+Keys, types and defaults are those of the signatures of the constructors, and errors of values are
+sentences.
 """
 
 from __future__ import annotations
@@ -87,7 +89,7 @@ class Section:
 
     @property
     def is_complete(self) -> bool:
-        """Whether YAML can represent all required parameters."""
+        """True if YAML can represent all required parameters."""
         try:
             return self.keys is not None
         except TypeError:
@@ -131,7 +133,7 @@ class Section:
         return values
 
     def _with_new_names(self, tree: Any, where: str, file: str) -> Any:
-        """The section with keys that were renamed under their new names."""
+        """Return the section with renamed keys under their new names."""
         known = self.model.model_fields
         for key in [key for key in tree if key not in known] if isinstance(tree, dict) else []:
             first, _, inner = RENAMED.get(str(key), "").partition(".")
@@ -162,7 +164,8 @@ class Section:
             return self.target(**{**made, **{name: value for name, value in given.items() if "." not in name}})
         except (ValueError, TypeError) as error:
             if isinstance(lacked := error.__cause__, AttributeError) and any(lacked.obj is x for x in context.values()):
-                raise  # no key is wrong: what the context holds, such as a radar, has no such attribute
+                # no key is wrong: an object of the context, such as a radar, lacks an attribute
+                raise
             text = one_line(error)
             raise ConfigError(f"{file}: {text if text.startswith(f'{where}.') else f'{where}: {text}'}") from None
 
@@ -281,7 +284,7 @@ def below(given: Given, name: str) -> dict[str, Tensor]:
 
 
 def _key(hint: Any, default: Any) -> Key | None:
-    """The key for a type, None if YAML cannot represent it."""
+    """Key for a parameter of a type; None if YAML cannot represent the type."""
     arms, plain = members_of(hint), _plain(hint)
     if plain is not None:
         scalars = {item for arm in arms for item in (members_of(typing.get_args(arm)[0]) if _is_list(arm) else [arm])}
@@ -301,7 +304,9 @@ def _key(hint: Any, default: Any) -> Key | None:
 
 
 def _inner(hint: Any) -> tuple[Section | Catalogue | None, str]:
-    """The section or catalogue of a type, and whether the type is a collection of these."""
+    """Section or catalogue of a type, and the kind of collection if the type is a collection of
+    such objects.
+    """
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin is typing.Annotated:
         return next(((extra, "") for extra in args[1:] if isinstance(extra, Catalogue)), (None, ""))
@@ -321,13 +326,15 @@ def _described_default(default: Any, inner: Section | Catalogue, many: str) -> A
 
 
 def _described(value: Any) -> dict[str, Any]:
-    """The fields of a dataclass object that YAML can represent."""
+    """Fields of a dataclass object that YAML can represent."""
     found = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
     return {name: list(x) if isinstance(x, tuple) else x for name, x in found.items() if isinstance(x, _YAML)}
 
 
 def _default(target: Callable[..., Any], parameter: inspect.Parameter) -> Any:
-    """The default of a parameter, also if a field factory makes it; `...` if it is required."""
+    """Default of a parameter, also if a field factory makes it; `...` if the parameter is
+    required.
+    """
     field = getattr(target, "__dataclass_fields__", {}).get(parameter.name)
     if field is not None and field.default_factory is not dataclasses.MISSING:
         return field.default_factory()
@@ -339,9 +346,8 @@ def _is_list(hint: Any) -> bool:
 
 
 def _plain(hint: Any) -> Any | None:
-    """The part of a type that YAML can represent, None if there is none.
-
-    Tensors become numbers or lists of numbers.
+    """Part of a type that YAML can represent; None if there is none. Tensors become numbers or
+    lists of numbers.
     """
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if hint in _SCALARS or origin is typing.Literal:
@@ -362,7 +368,9 @@ def _plain(hint: Any) -> Any | None:
 
 
 def _converted(value: Any, key: Key, given: Given) -> Any:
-    """The value for the constructor: a list becomes a tensor or a tuple, with values per trial."""
+    """Convert a value for the constructor: a list becomes a tensor or a tuple, with values per
+    trial.
+    """
     if isinstance(value, list):
         value = [given.get(str(i), item) for i, item in enumerate(value)]
         return torch.tensor(value, dtype=torch.float64) if key.as_tensor else tuple(value)
@@ -378,7 +386,7 @@ def snake(name: str) -> str:
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", name).lower()
 
 
-# keys, values, stages and kinds that were renamed; old ones are accepted with a sentence
+# keys, values, stages and kinds that were renamed; old names are accepted with a message
 RENAMED = {
     "damages": "impairments",
     "told": "trigger_known",
@@ -442,13 +450,13 @@ RENAMED = {
 
 
 class Strict(BaseModel):
-    """Base of all sections; it rejects unknown keys, wrong types and infinities."""
+    """Base of all sections. It rejects unknown keys, wrong types and infinities."""
 
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
 
 
-# order in which errors are reported: an unknown key, a missing key, a wrong value. If a number or a
-# list is accepted, the error of the number is more informative than that of the list.
+# Order in which errors are reported: an unknown key, a missing key, a wrong value. If both a number
+# and a list are accepted, the error of the number is more informative.
 _RANK = {"extra_forbidden": 0, "missing": 1, "list_type": 3}
 
 
@@ -480,7 +488,7 @@ def sentence(error: ValidationError, model: type[BaseModel], file: str, where: s
         text = "should be a mapping of keys" + (", and not an empty one" if kind == "too_short" else "")
     if isinstance(given, str) and given in RENAMED:
         text = f"should be {RENAMED[given]!r}, as it is now called"
-    if not key:  # an error of the whole config, not of one key
+    if not key:  # the error concerns the whole config, not one key
         return f"{file}: {text}"
     shown = repr(given)
     if not text.startswith("should"):
@@ -489,7 +497,7 @@ def sentence(error: ValidationError, model: type[BaseModel], file: str, where: s
 
 
 def _descend(model: type[BaseModel], path: list[str]) -> tuple[list[str], type[BaseModel] | None]:
-    """The keys in a pydantic location, without tags of unions, and the section of the last key."""
+    """Keys in a pydantic location, without tags of unions, and the section of the last key."""
     names: list[str] = []
     section, hint = None, model
     for part in path:

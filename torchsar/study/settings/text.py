@@ -13,8 +13,8 @@ from yaml.composer import ComposerError
 
 from torchsar.study.settings.errors import ConfigError, did_you_mean, one_line
 
-# tags and their values by the rules of YAML 1.2, also with '_' between digits: 1e-6 is a number and
-# 017 is 17, while 1:30, 2024-01-31, yes and 0b1 are texts
+# Tags and their values by the rules of YAML 1.2, in which '_' may also be between digits. Thus 1e-6
+# is a number and 017 is 17, while 1:30, 2024-01-31, yes and 0b1 are texts.
 _RULES = {
     "int": (r"[-+]?[0-9][0-9_]*|0o[0-7]+|0x[0-9a-fA-F]+", "-+0123456789"),
     "float": (
@@ -24,8 +24,8 @@ _RULES = {
     "bool": (r"true|True|TRUE|false|False|FALSE", "tTfF"),
     "null": (r"~|null|Null|NULL|", ["~", "n", "N", ""]),
 }
-# sections and lists inside each other, and values of a document with all its repetitions: far more
-# than configs have, and few enough for any later step
+# Largest depth of sections and lists inside each other, and largest number of values in a document
+# with all repetitions. Both are far more than configs have, and few enough for all later steps.
 _DEEPEST, _MOST_VALUES = 50, 200_000
 
 
@@ -44,10 +44,11 @@ class _Loader(yaml.SafeLoader):
         self.depth -= 1
         parts: Any = node.value
         if isinstance(parts, str):
-            parts = parts.encode()[:0]  # a ValueError for half of a pair of surrogates
+            parts = parts.encode()[:0]  # this raises a ValueError for half of a surrogate pair
         if not again:
             node.size = 1 + sum(one.size for part in parts for one in (part if isinstance(part, tuple) else [part]))
-        if getattr(node, "size", math.inf) > _MOST_VALUES:  # infinite inside itself
+        # the size is infinite for a node that contains itself
+        if getattr(node, "size", math.inf) > _MOST_VALUES:
             raise ComposerError(None, None, f"more than {_MOST_VALUES} values with all repetitions", mark)
         return node
 
@@ -83,7 +84,7 @@ _Dumper.add_representer(
     ),
 )
 for _tag, (_rule, _first) in _RULES.items():
-    for _kind in (_Loader, _Dumper):  # texts that look like a number are written with quotes
+    for _kind in (_Loader, _Dumper):  # texts that look like numbers are written with quotes
         _kind.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"^(?:{_rule})$"), list(_first))
 _Dumper.add_representer(tuple, lambda dumper, items: dumper.represent_list(list(items)))
 
@@ -99,7 +100,7 @@ def parse(text: str, what: str) -> Any:
         ConfigError: If it is no YAML; the message has the source and the line.
     """
     try:
-        return yaml.load(text, Loader=_Loader)  # a SafeLoader
+        return yaml.load(text, Loader=_Loader)  # the loader is a SafeLoader
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         line = f", line {mark.line + 1}" if mark else ""

@@ -159,12 +159,13 @@ def estimated_phase(chain: Chain, trace: Trace, like: Tensor) -> Tensor:
 
 
 def _bound_ratio(bench: Bench) -> float | None:
-    """Ratio of the bound of unknown amplitudes to that of a known scene, computed for one scene;
-    None if it would take too long.
+    """Ratio of the bound for unknown amplitudes to that for a known scene, computed for one scene.
+    It is None if the computation would take too long.
     """
     size, world, radar = bench.world(), bench.world().of(bench.radar), bench.radar
     scene = world.scene.scatterers(bench.draws("bound"))
-    # the bound inverts a matrix of at most this size, within a second on one core
+    # the bound requires the inverse of a matrix; up to this size it takes about a second on one
+    # core
     few = scene.amplitude.shape[-1] <= 1200 and 2 < size.pulses <= 800
     if not isinstance(world.fidelity, PhaseOnly) or not few:
         return None
@@ -205,8 +206,8 @@ def _images(result: Result) -> Drawn:
 
 
 def _phases(result: Result, near_rad: float = 0.3) -> Drawn:
-    """Draw the true phase errors and the residual phases; those with an rms below `near_rad` have a
-    panel of their own.
+    """Draw the true phase errors and the residual phases. Residual phases with an rms below
+    `near_rad` have a separate panel.
     """
     true = whole_phase(result.first.trials)[0].cpu()
     pulses = np.arange(true.numel())
@@ -234,7 +235,7 @@ def _phases(result: Result, near_rad: float = 0.3) -> Drawn:
     yield "phases", "Phase errors", caption, plot.panels(parts)
 
 
-# iterations of `autofocus` that are compared: its defaults, 120 and 20, and fewer
+# numbers of iterations of `autofocus` that are compared: its defaults, 120 and 20, and fewer
 _EFFORTS = ((0, 5), (10, 5), (30, 10), (120, 10), (120, 20))
 
 
@@ -357,14 +358,14 @@ class Isal(System):
         image = beside_direct_sum(partial(_summed, bench), "migration while the target turns")
         return [
             *echo_choices(bench),
-            # without a rotation rate the image has no cross range
+            # without a rotation rate, the image has no cross range in metres
             *([] if bench.radar.rotation_rad_s is None else [image]),
             Choice("effort of autofocus", "autofocus.search", efforts, partial(_efforts, bench)),
         ]
 
 
 def _efforts(bench: Bench) -> Measured:
-    """`autofocus` with fewer iterations, on trials with the echo model `phase_only`."""
+    """Measure `autofocus` with fewer iterations, on trials with the echo model `phase_only`."""
     world, draws = bench.world(), bench.draws("trade", range(bench.config.trade.trials))
     trials = replace(world, fidelity=PhaseOnly()).trials_of(bench.radar, draws, bench.dtype, bench.device)
     data, truth, present = trials.recording.signal.data, whole_phase(trials), received(trials)
@@ -387,7 +388,7 @@ def _summed(bench: Bench) -> DirectlySummed:
     rate = radar.rotation_rad_s if world.rotation_rad_s is None else world.rotation_rad_s
     turning = float(torch.as_tensor(rate).reshape(-1)[0])
     angle = rotation_angle(radar, world.pulses, turning, torch.empty(()))
-    # the axis has the scale of the assumed rate
+    # the axis is scaled by the assumed rate
     cross, image = radar.image_axes(axes)[0].values() * (radar.rotation_rad_s / turning), AzimuthTransform(radar)
     return turning_target(
         *(radar, angle, cross, 0.0, world.samples, bench.draws()),

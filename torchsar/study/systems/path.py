@@ -74,7 +74,7 @@ class Track:
 
 @dataclass(frozen=True)
 class Recorded:
-    """What navigation records of a path.
+    """Errors of the recorded positions of a path.
 
     Args:
         x: Errors along axis x by name, which add up.
@@ -185,10 +185,11 @@ def residual_m(chain: Chain, trace: Trace, trials: Trials, wavelength_m: float, 
 
 
 def _positions(off: Tensor, at: Tensor) -> dict[str, Tensor]:
-    """The common shift of points in m, (trial,), and the rms distance that is left of them in m.
+    """Common shift of points in m, (trial,), and the rms distance in m that remains after it is
+    removed.
 
-    Of more than three points a linear displacement is removed besides: rotation and stretch of the
-    image. off: displacements (trial, point, 2); at: places (trial, point, 2).
+    With more than three points, a linear displacement is also removed: rotation and stretch of the
+    image. off: displacements (trial, point, 2); at: positions (trial, point, 2).
     """
     basis = torch.cat([torch.ones_like(at[..., :1]), at[..., : 2 * (at.shape[1] > 3)]], -1)
     left = (off - basis @ (torch.linalg.pinv(basis) @ off)).square().sum(-1).mean(-1).sqrt()
@@ -198,13 +199,15 @@ def _positions(off: Tensor, at: Tensor) -> dict[str, Tensor]:
 def _points(
     bench: Bench, chain: Chain, image: Signal, trials: Trials, reach_m: float = 10.0
 ) -> tuple[dict[str, Metrics], list[str], dict[str, Tensor]]:
-    """Metrics of the named points in the image, the names of those outside it, and what their
-    displacements have in common. A point is sought within `reach_m`, or less if another is near.
+    """Metrics of the named points in the image, names of those outside it, and the displacement
+    that the points have in common.
+
+    A point is sought within `reach_m`, or less if another point is near.
     """
     stage = last_image(chain.stages.values())
     if stage is None:
         return {}, [], {}
-    (_, cos, _), (_, sin, _) = stage.grid.axes.tolist()  # azimuth and range axes of the image
+    (_, cos, _), (_, sin, _) = stage.grid.axes.tolist()  # axes of the image in azimuth and range
     places, outside = {}, []
     image = image.with_data(image.data.expand(trials.count, *image.data.shape[-2:]))
     for name, place in bench.world().named_points.items():
@@ -217,7 +220,7 @@ def _points(
             outside.append(name)
     if not places:
         return {}, outside, {}
-    at = torch.stack([*places.values()], 1)  # (trial, point, 2)
+    at = torch.stack([*places.values()], 1)  # shape (trial, point, 2)
     apart = torch.cdist(at, at) + 2 * reach_m * torch.eye(len(places), dtype=torch.float64, device=at.device)
     search_m = max(image.axes[0].step, min(reach_m, float(apart.min()) / 2))
     found = impulse_response(image, (at[..., 0], at[..., 1]), search_m=search_m)
@@ -239,9 +242,9 @@ def _images(result: Result) -> Drawn:
 
 
 def _paths(result: Result) -> Drawn:
-    """Draw how the true path deviates from a straight line, and what is left of its errors."""
+    """Draw the deviations of the true path from a straight line, and its remaining errors."""
     trials = result.first.trials
-    if not trials.truth:  # a recording to which no errors were added
+    if not trials.truth:  # no errors were added to the recording
         return
     time = plot.array(trials.recording.signal.axes[-2].offsets())
     shown: dict[tuple[str, str], dict[str, np.ndarray]] = {}
@@ -390,7 +393,7 @@ class AnyPath(System):
         points = torch.stack(
             torch.broadcast_tensors(*(truth[f"{axis}_m"] for axis in ("range", "azimuth", "height"))), -1
         )
-        # a bound of more pulses * samples * scatterers would take more than some seconds
+        # for more pulses * samples * scatterers, the bound would take more than some seconds
         aux = batch.trials.clean.aux
         antennas = AntennaPath.recorded(aux)
         if antennas.pulses * len(aux["frequency_hz"]) * points.shape[-2] > 10_000_000 or bench.world().beam is not None:
@@ -420,7 +423,7 @@ class AnyPath(System):
         )
 
     def requirements(self, bench: Bench) -> Sequence[Requirement]:
-        """Return what the flight of the first trial requires, see `flight_requirements`."""
+        """Return the requirements of the flight of the first trial, see `flight_requirements`."""
         if bench.recording is not None:
             path, beam = AntennaPath.recorded(bench.recording.aux), None
             return flight_requirements(bench.radar, path, path, beam)
@@ -439,7 +442,7 @@ class AnyPath(System):
         )
         antennas, grid = AntennaPath.recorded(clean.aux), stage.grid
         geometry = (clean.aux["frequency_hz"], antennas.transmitter_m, antennas.receiver_m, antennas.reference_m)
-        # tiles sum the pulses of the recommended method
+        # tiles sum the pulses that the recommended method uses
         seen = stage.lit(antennas), stage.weight(antennas)
         tiles = possible_plans(lambda error: TilePlan(*geometry, grid, error, *seen), (-20.0, -40.0, -60.0, -80.0))
         alternatives = [
@@ -451,7 +454,7 @@ class AnyPath(System):
             )
             for error, plan in tiles.items()
         ]
-        # by the beam of the method that uses omega-K, if there is one
+        # the beam is that of the method that uses omega-K, if there is one
         lit = None if bench.recording is not None else bench.world().beam
         images = (s for c in bench.chains.values() for s in c.stages.values() if isinstance(s, OmegaKImage))
         beams = [image.beam for image in images if image.beam is not None]
@@ -475,10 +478,10 @@ class AnyPath(System):
 def flight_requirements(
     radar: InverseRadar, true: AntennaPath, recorded: AntennaPath, beam: SideBeam | None
 ) -> list[Requirement]:
-    """Return what simplifications neglect over a flight, seen from the origin.
+    """Return the errors of simplifications over a flight, seen from the origin.
 
-    Phases are the largest within an aperture, without constant and linear terms, which shift the
-    image: that of the record, or of the time in which a beam sees a point.
+    They are the largest phases within an aperture, without constant and linear terms, which shift
+    the image. The aperture is the whole record, or the time in which a beam illuminates a point.
 
     Args:
         radar: Carrier and pulse rate.
@@ -508,7 +511,9 @@ def flight_requirements(
     dwell_s = count / radar.prf_hz
 
     def left_m(distance: Tensor) -> float:
-        """Largest distance within an aperture without its straight line."""
+        """Largest magnitude of a distance within an aperture, after its straight line is
+        removed.
+        """
         parts = distance.unfold(0, count, max(1, count // 2))
         line = basis[:count]
         return float((parts.mT - line @ torch.linalg.lstsq(line, parts.mT).solution).abs().max())
@@ -516,7 +521,8 @@ def flight_requirements(
     bent, error = (left_m(x @ sight) for x in (place - basis @ torch.stack([start, velocity]), known - place))
     distance = place.norm(dim=-1)
     moved = left_m(torch.gradient(distance, spacing=(time,))[0] * distance / LIGHT_M_S)
-    # the phase pi / 4 at the ends of the aperture, 4 pi / lambda v dv (T / 2)^2 / R
+    # speed error dv for a phase of pi / 4 at the ends of the aperture, 4 pi / lambda v dv
+    # (T / 2)^2 / R
     tolerated = radar.wavelength_m * range_m / (4 * speed * dwell_s**2) if speed > 0 else math.inf
     off = abs(float(torch.linalg.lstsq(basis, known - place).solution[1] @ heading))
     turn, quarter = 4 * math.pi / radar.wavelength_m, math.pi / 4
@@ -540,7 +546,7 @@ def _measured(
     plans: Mapping[float, MotionCompensation | TilePlan],
     stage: PathImage,
 ) -> Measured:
-    """Images of white noise, at random pixels beside the direct sum."""
+    """Measure images of white noise at random pixels, relative to the direct sum."""
     draws, every = bench.draws(), stage.grid.pixels_m().reshape(-1, 3)
     noise = white_noise(draws, geometry[1].shape[-2], len(geometry[0]))
     some = some_pixels(draws, len(every))

@@ -1,3 +1,3 @@
-"""Experiments: the physics of a system, the objects that a config builds (its bench), batches of
+"""Experiments: the physics of a system, the bench (the objects that a config builds), batches of
 trials, and the results of the methods.
 """

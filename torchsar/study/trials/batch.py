@@ -199,7 +199,9 @@ def rows(x: Tensor, count: int) -> Tensor:
 
 
 def used_values(chain: Chain, trace: Trace, name: str) -> list[Tensor]:
-    """Return what each stage of a chain was given for a value, in float64, as far as it ran."""
+    """Return the values that the stages of a chain used under a name, in float64, as far as the
+    chain ran.
+    """
     users = [stage for stage, uses in chain.uses.items() if name in uses and stage in trace.arguments]
     return [trace.arguments[stage][name].to(torch.float64) for stage in users]
 

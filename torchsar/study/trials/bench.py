@@ -228,7 +228,7 @@ class Bench:
             trace, estimates, seconds = self._run(name, method, trials, earlier)
             system = self.system
             fault = fault_of_image(trace.signal, system.images, system.ending) if detail and system.ending else ""
-            if fault:  # a chain that ends without an image is a mistake of the config
+            if fault:  # a chain that ends without an image is a mistake in the config
                 raise (ValueError if trace.signal.names in system.images else ConfigError)(f"processor.{name}, {fault}")
             with gathered_checks():
                 judged = self.system.judge(self, name, replace(trace, estimates=estimates), trials, detail)
@@ -242,7 +242,7 @@ class Bench:
                 raise ConfigError(f"{self.file}: processor.{name}: {text}") from error
             log.warning("warning: %s failed: %s", name, text)
             return Processed(Judged(verdict(codes)), failed=text, marks={"outcomes": codes})
-        # without targets there is no code, which is OK, 0
+        # the code 0, which is OK, is added for estimates without targets
         codes = {stage: pad(rows(e.outcome, trials.count), (1, 0)).amax(1) for stage, e in estimates.items()}
         spent = torch.full((trials.count,), sum(seconds.values()) / trials.count, dtype=torch.float64)
         measured = {key: rows(x.detach(), trials.count).double().mean(1) for key, x in trace.metrics.items()}
@@ -255,8 +255,9 @@ class Bench:
     def _run(
         self, name: str, method: Method, trials: Trials, earlier: Mapping[str, Processed]
     ) -> tuple[Trace, Mapping[str, Estimate], Mapping[str, float]]:
-        """The trace of a method, its estimates and its times. Estimates of earlier methods by the
-        same stages from the same data are reused.
+        """Run a method, and return its trace, its estimates and its computing times.
+
+        Estimates of earlier methods by the same stages from the same data are reused.
         """
         chain, recording = self.chains[name], trials.clean if method.input == "clean" else trials.recording
         if method.rerun is not None:
@@ -277,7 +278,7 @@ class Bench:
         return trace, trace.estimates, {**trace.seconds, **spent}
 
     def _shared(self, method: Method, earlier: Mapping[str, Processed]) -> Processed:
-        """Reusable estimates of the earlier method with the most initial stages in common."""
+        """Reusable estimates of the earlier method that has the most initial stages in common."""
         best, found = [], Processed(Judged({}))
         for name, outcome in earlier.items():
             other = self.config.processor[name]
@@ -291,7 +292,7 @@ class Bench:
         return replace(found, estimates=kept)
 
     def _compared(self, outcomes: Mapping[str, Processed]) -> dict[str, Processed]:
-        """The outcomes with the metrics relative to the reference."""
+        """Add the metrics relative to the reference method to the outcomes."""
         reference = getattr(self.judging, "reference", None)
         ideal = outcomes.get(reference or "")
         ideal = None if ideal is None or ideal.failed else ideal
@@ -302,7 +303,7 @@ class Bench:
 
     @contextmanager
     def _named(self, what: str) -> Iterator[None]:
-        """Turn an error of the simulation into a ConfigError."""
+        """Convert an error of the simulation to a ConfigError."""
         try:
             yield
         except ConfigError:
@@ -324,7 +325,7 @@ class Bench:
                 hook.remove()
 
 
-# errors whose text says what is wrong; torch itself raises RuntimeError
+# errors whose text describes the problem; torch itself raises RuntimeError
 _PLAIN = (ValueError, TypeError, KeyError, RuntimeError)
 # prefix of true values
 TRUTH = "truth."
@@ -397,7 +398,7 @@ def _chain(loaded: Loaded, method: Method, where: str, context: Mapping[str, Any
 
 
 def _checked_sources(entry: Mapping[str, Any], method: Method, loaded: Loaded, where: str) -> dict[str, str]:
-    """The sources of the values of a stage; only an oracle and metrics may use true values."""
+    """Sources of the values of a stage. Only an oracle and metrics may use true values."""
     uses = entry.get("uses", {})
     for key, source in {} if entry["stage"] == "measure" else uses.items():
         true, name = source.startswith(TRUTH), source.removeprefix(TRUTH)

@@ -1,5 +1,7 @@
-"""Choices that a config makes, such as the form of the focusing, and their alternatives, of which
-`auto` takes the cheapest one with an acceptable predicted loss, or the most exact one.
+"""Choices that a config makes, such as the form of the focusing, and their alternatives.
+
+The value `auto` selects the cheapest alternative with an acceptable predicted loss, or the most
+exact one if there is none.
 """
 
 from __future__ import annotations
@@ -52,7 +54,7 @@ class Alternative:
     effect: str = ""
 
 
-# lower levels are differences by rounding in double precision
+# lower levels are differences due to rounding in double precision
 EXACT_DB = -280.0
 
 
@@ -201,9 +203,11 @@ def resolved(loaded: Loaded, bench_of: Callable[[Loaded], Any]) -> tuple[Loaded,
 
 
 def _automatic(config: Config, keys: Collection[str]) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
-    """Every `auto`: the key of its choice (`Choice.at`), the path of its mapping, the mapping.
+    """Generate every `auto` of a config, as the key of its choice (`Choice.at`), the path of its
+    mapping, and the mapping.
 
-    keys: "STAGE.KEY" of the keys that may be left to choose; other keys may have such a value too.
+    keys: "STAGE.KEY" of the keys that may be `auto`. Other keys may have the same value with
+    another meaning.
     """
     for key, value in (config.world or {}).items():
         if isinstance(value, Mapping) and value.get("kind") == AUTO:
@@ -218,9 +222,10 @@ def _automatic(config: Config, keys: Collection[str]) -> Iterator[tuple[str, str
                     yield f"{entry['stage']}.{key}", path, entry
 
 
-# distance of the antenna from a turning target: float64 resolves a path to 3e-11 m there
+# distance of the antenna from a rotating target; at this distance float64 resolves a path to 3e-11
+# m
 _FAR_M = 1e5
-# pixels at which images are compared, by choice
+# number of pixels at which images are compared, by choice
 PIXELS = 256
 
 
@@ -373,7 +378,7 @@ def ladar_strip(
     some = some_pixels(draws, len(pixels))
     cell = torch.arange(range_.n, dtype=torch.float64) - range_.n // 2
     band, data = radar.wave_speed_m_s / (2 * range_.step), noise.to(dtype)
-    # dechirped echoes have the conjugate phase; the filter gives the mean over an aperture
+    # dechirped echoes have the conjugate phase, and the filter gives the mean over an aperture
     turns = 2 * (pixels[some, 0] - middle) / radar.wavelength_m
     step = radar.speed_m_s * pulse.step
     lit = 2 * torch.floor((beam_rad or 0.0) * pixels[some, 0] / (2 * step)) + 1
@@ -406,8 +411,9 @@ def points_at_rest(
 ) -> DirectlySummed:
     """Describe the image of points at rest near random pixels by several receive channels.
 
-    Noise does not serve: reconstruction inverts the sampling by the channels, which the direct sum
-    leaves as it is. Receive paths count once, so that the frequencies are half those of the radar.
+    Noise is not suitable, because reconstruction inverts the sampling by the channels, which the
+    direct sum does not. Receive paths are travelled once, so that the frequencies are half those of
+    the radar.
 
     Args:
         radar: Radar parameters.
@@ -428,7 +434,7 @@ def points_at_rest(
     lines, cells = stationary_axis(radar, axes[1], stage.rebuild.bands), axes[2]
     reach = max(0.0, size[0] / radar.prf_hz - lit_s) / 2 * radar.speed_m_s
     rows = slice(*(round(float(lines.index_of(y))) + more for y, more in ((-reach, 0), (reach, 1))))
-    columns = slice(cells.n // 4, 3 * cells.n // 4)  # holds the migration
+    columns = slice(cells.n // 4, 3 * cells.n // 4)  # the margins contain the migration
     along, closest = lines.values()[rows], cells.values()[columns] - radar.reference_range_m
     pixels = torch.cartesian_prod(along, closest, along.new_zeros(1))[:, [1, 0, 2]]
     some = some_pixels(draws, len(pixels))
@@ -461,7 +467,7 @@ def points_of_a_strip(
 ) -> DirectlySummed:
     """Describe the image of lit points of a strip at the pixels nearest to them.
 
-    Noise does not serve: points have the Doppler of their dwell only, noise that of the whole PRF.
+    Noise is not suitable: points have only the Doppler of their dwell, noise that of the whole PRF.
 
     Args:
         radar: Radar parameters.
@@ -498,7 +504,7 @@ def points_of_a_strip(
         # an image may have several lines per pulse
         lambda made: made[:: made.shape[0] // pulses][index[0], index[1]] * unit_phasor(turns, made.dtype),
         len(slant) / (pulses * n),
-        # as in `PointPatches.exact`; x is the closest range
+        # weights as in `PointPatches.exact`; x is the closest range
         lambda some, points: points[:, 0].rsqrt().expand(len(place[some]), -1),
         radar.wave_speed_m_s,
     )

@@ -10,11 +10,11 @@ from torch import Tensor
 from torchsar.core import Axis, Signal, cis
 from torchsar.metrics.impulse import impulse_response
 
-# samples to either side that a cut has at least, and further ones that its interpolation needs
+# least number of samples of a cut to either side, and further ones that its interpolation needs
 _LEAST, _MORE = 24, 8
-# positions of a cut per sample
+# number of points of a cut per sample
 _FACTOR = 16
-# -3 dB width of a response over the spacing of its nulls
+# -3 dB width of a response, divided by the spacing of its nulls
 _WIDTH = 0.886
 
 
@@ -37,7 +37,7 @@ def impulse_cuts(image: Signal, at_m: tuple[float, float]) -> dict[str, tuple[Te
     positions, windows, reaches = [], [], []
     for axis in image.axes:
         nulls = float(measured[f"irw_{axis.name}_m"]) / _WIDTH / axis.step
-        # null spacings to either side that a cut has: ten side lobes and half of the main lobe
+        # number of null spacings of a cut to either side: ten side lobes and half of the main lobe
         reach = min(max(_LEAST, math.ceil(11 * nulls)), axis.n // 2) if math.isfinite(nulls) else _LEAST
         at = float(axis.index_of(measured[f"position_{axis.name}_m"]))
         first = max(0, min(round(at) - reach - _MORE, axis.n - 2 * (reach + _MORE)))
@@ -95,12 +95,12 @@ def about_peak(image: Signal, reach: tuple[float, float], samples: int) -> Signa
 
 
 def _centre_turns(patch: Tensor, dim: int) -> float:
-    """Centre of the spectrum along dim in turns per sample."""
+    """Centre of the spectrum along dim in cycles per sample."""
     n = patch.shape[dim]
     return float(torch.angle((patch.narrow(dim, 1, n - 1) * patch.narrow(dim, 0, n - 1).conj()).sum())) / (2 * math.pi)
 
 
 def _kernel(places: Tensor, n: int, tone: float) -> Tensor:
-    """Weights (place, n) that read a band about `tone` at fractional places."""
+    """Weights (place, n) that interpolate a band around `tone` at fractional positions."""
     distance = places[:, None] - torch.arange(n, dtype=torch.float64)
     return torch.sinc(distance) * cis(2 * math.pi * tone * distance)

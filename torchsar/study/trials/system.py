@@ -154,7 +154,7 @@ class System(ABC):
     peak: ClassVar[float] = 8.0
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """A system has no state: other processes build it from its class."""
+        """Systems have no state, so that other processes build them from their class."""
         return type(self), ()
 
     @cached_property
@@ -165,7 +165,7 @@ class System(ABC):
     def stages(self) -> Catalogue:
         return stages()
 
-    # physics of every system
+    # methods that simulate and judge, which every system has
 
     def simulate(self, bench: Bench, world: Any, draws: Draws) -> Trials:
         """Simulate the trials in `draws`; numbers of the world may differ between trials.
@@ -198,18 +198,20 @@ class System(ABC):
         """Return the size of the largest tensor of a trial in bytes."""
         return int(self.peak * self.samples(bench.world(), bench.radar) * bench.dtype.itemsize)
 
-    # optional physics
+    # methods that a system may override
 
     def read(self, path: str, dtype: torch.dtype) -> Recording:
         """Return the recording in a file. Raises ValueError or OSError."""
         raise NotImplementedError(f"system {self.name} reads no recordings")
 
     def context(self, recording: Recording) -> dict[str, Any]:
-        """Return what constructors of stages need from a recording, in addition to its radar."""
+        """Return the values that constructors of stages need from a recording, in addition to its
+        radar.
+        """
         return {}
 
     def check(self, bench: Bench) -> None:
-        """Check what no constructor checks. Raises ConfigError."""
+        """Check values that no constructor checks. Raises ConfigError."""
 
     def check_sweep(self, loaded: Loaded, grid: Mapping[str, Any]) -> None:
         """Check that the axes of a grid are consistent. Raises ConfigError."""

@@ -54,7 +54,7 @@ class Judging:
 
 
 class View(NamedTuple):
-    """What pictures need of a method: images and spectra without noise, and their geometry."""
+    """Data of a method that pictures need: images and spectra without noise, and their geometry."""
 
     image: Signal | None
     spectrum: Signal | None
@@ -268,7 +268,9 @@ def _held(chain: Chain, trace: Trace) -> dict[str, Any]:
 
 
 def _clutter(world: Points, radar: BistaticRadar) -> Tensor | None:
-    """Covariance of white noise of unit variance and the sea, across channels, by Doppler bin."""
+    """Covariance of white noise of unit variance and of the sea, across channels, for each Doppler
+    bin.
+    """
     if world.sea is None:
         return None
     gate = world.gate if world.sea_gate is None else world.sea_gate

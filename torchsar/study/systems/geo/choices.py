@@ -1,4 +1,4 @@
-"""Processing of moving points: its limits, what simplifications neglect, and its alternatives."""
+"""Processing of moving points: its limits, the errors of simplifications, and its alternatives."""
 
 from __future__ import annotations
 
@@ -65,12 +65,13 @@ _ESTIMATORS: dict[type, Estimator] = {
     GradientVelocity: "ml",
     MovingPointVelocity: "ml",
 }
-# integration time (s) of the source, for targets that are seen through a pattern
+# integration time (s) of the source, for targets that are illuminated through an antenna pattern
 _PATTERN_S = 4.5
-# range lines on which two-dimensional chains are compared, which hold the migration of any
-# aperture, and integration times that their pulses last
+# _LINES: range lines on which two-dimensional chains are compared; they contain the migration of
+# any aperture.
+# _APERTURES: number of integration times that the pulses cover.
 _LINES, _APERTURES = 128, 1.5
-# corrections of range migration, and the rows of the requirements that are about their losses
+# corrections of range migration, and the rows of the requirements that describe their losses
 _MIGRATIONS = {
     "none": (NoMigration(), {"kind": "no_migration"}, "no range migration correction"),
     "static_bulk": (
@@ -90,22 +91,23 @@ def limits(bench: Bench) -> dict[Limit, list[str]]:
 
 
 def requirements(bench: Bench) -> Sequence[Requirement]:
-    """Return what simplified processing neglects; nothing if a target is as fast along track as the
-    receiver, since no aperture forms then.
+    """Return the errors of simplified processing; nothing if a target is as fast along track as the
+    receiver, because no aperture forms then.
     """
     use = use_of(bench.chains["recommended"], bench)
     return multichannel_requirements(bench.radar, use) if bench.radar.speed_m_s > use.u_a_m_s[1] else ()
 
 
 def use_of(chain: Chain, bench: Bench) -> MultichannelUse:
-    """Return what limits and requirements of a chain depend on, besides the radar.
+    """Return the properties of a chain on which its limits and requirements depend, besides the
+    radar.
 
-    This is its record, reconstruction, migration correction and estimators, and the spans of
+    These are its record, reconstruction, migration correction and estimators, and the ranges of
     velocities and positions of the simulated targets.
     """
     world, stages = bench.world(), list(_stages(chain))
     rebuilds = [s for s in stages if isinstance(s, Reconstruct)]
-    # without a reconstruction the intensity ratio tells bands apart
+    # without a reconstruction stage, the intensity ratio separates the bands
     rebuilds = rebuilds or [s for s in stages if isinstance(s, SignalIntensityRatio)]
     estimators: tuple[Estimator, ...] = tuple(
         dict.fromkeys(_ESTIMATORS[type(stage)] for stage in stages if type(stage) in _ESTIMATORS)
@@ -134,7 +136,7 @@ def _span(world: Points, name: str) -> tuple[float, float]:
 
 
 def _stages(chain: Chain) -> Iterable[Any]:
-    """All stages, those inside of others too."""
+    """Generate all stages, including those inside of other stages."""
     for stage in chain.stages.values():
         inner = stage.estimator if isinstance(stage, MigratingLines) else stage
         yield from inner.estimators.values() if isinstance(inner, Alternate) else (inner,)
@@ -205,13 +207,13 @@ def _bandwidth_hz(bench: Bench) -> float | None:
 
 
 def _follows(bench: Bench) -> bool:
-    """Whether the recommended method corrects migration by an estimated velocity."""
+    """True if the recommended method corrects migration by an estimated velocity."""
     chain = bench.chains["recommended"]
     return any(isinstance(chain.stages[n], CorrectMigration) and bool(used) for n, used in chain.uses.items())
 
 
 def _alone(bench: Bench, dtype: torch.dtype | None = None, fastest: bool = False, **changes: Any) -> Trials:
-    """Clean echoes of the targets, or of the fastest one, azimuth only unless changed."""
+    """Simulate clean echoes of the targets, or of the fastest one; by default with azimuth only."""
     world = replace(bench.world(), sea=None, noise=Level(), impairments={}, samples=None, kind="compressed")
     if fastest:
         name = max(world.targets, key=lambda name: abs(float(world.targets[name].u_r_m_s)))
@@ -224,7 +226,7 @@ def _alone(bench: Bench, dtype: torch.dtype | None = None, fastest: bool = False
 def _image(
     bench: Bench, trials: Trials, band_hz: float | None = None, rebuild: Any = None, **settings: Any
 ) -> tuple[Signal, FocusedPoint]:
-    """Images of the targets with their true velocities, of the band that the config focuses."""
+    """Image the targets with their true velocities, in the band that the config focuses."""
     best = LeastSquares(min(2, bench.radar.channels))
     chain = known_motion_chain(bench.radar, rebuild or best, band_hz or _bandwidth_hz(bench), **settings)
     trace = chain.trace(trials.clean, {f"given.{name}": trials.truth[name] for name in TRUTHS})
@@ -243,8 +245,9 @@ def _orders(bench: Bench) -> Measured:
 
 
 def _cropped(bench: Bench) -> dict[str, Any]:
-    """The part of the record in which targets are lit for the band that is focused: replicas of
-    other bands migrate in their own way.
+    """The part of the record in which targets are illuminated for the band that is focused.
+
+    Replicas of other bands have a different migration.
     """
     world = bench.world()
     lit = _PATTERN_S if world.integration_s is None else float(world.integration_s)
@@ -254,10 +257,12 @@ def _cropped(bench: Bench) -> dict[str, Any]:
 
 
 def _migrated(bench: Bench) -> Measured:
-    """Against the response along azimuth times that along range, which migration leaves alone.
+    """Measure the loss relative to the response along azimuth times that along range, which
+    migration does not change.
 
-    Only the band is focused that is lit at every range frequency: exact imaging, as the keystone
-    transform, stretches the ends of the spectrum along azimuth in proportion to the frequency.
+    Only that band is focused which is illuminated at every range frequency. Exact imaging, such as
+    the keystone transform, stretches the ends of the spectrum along azimuth in proportion to the
+    frequency.
     """
     size, radar = _cropped(bench), bench.radar
     slowest = radar.speed_m_s - _span(bench.world(), "u_a_m_s")[1]
@@ -284,7 +289,7 @@ def _precisions(bench: Bench) -> Measured:
 
 
 def _rebuilt(bench: Bench) -> Measured:
-    """False targets by each reconstruction."""
+    """Measure the false targets of each reconstruction."""
     trials = _alone(bench)
 
     def loss(one: Alternative, made: tuple[Signal, FocusedPoint]) -> Mapping[str, float]:
@@ -295,7 +300,7 @@ def _rebuilt(bench: Bench) -> Measured:
 
 
 def _received(bench: Bench) -> Measured:
-    """Echoes by each model of the receive range."""
+    """Measure the errors of the echoes by each model of the receive range."""
 
     def echo(one: Alternative, dtype: torch.dtype | None = None) -> Tensor:
         model = TaylorRange(one.keys["order"]) if one.keys["kind"] == "taylor_range" else ExactRange()
@@ -306,8 +311,10 @@ def _received(bench: Bench) -> Measured:
 
 
 def _dimensions(bench: Bench) -> Measured:
-    """The fastest target by azimuth-only data, range-compressed lines and full chirps."""
-    # echoes begin at the middle of the axis
+    """Measure the response of the fastest target with azimuth-only data, range-compressed lines and
+    full chirps.
+    """
+    # echoes begin in the middle of the axis
     longer = _LINES + 2 * bench.radar.pulse.n_samples(bench.radar.sampling_hz)
     sizes: tuple[dict[str, Any], ...] = ({}, {"samples": _LINES}, {"samples": longer, "kind": "full"})
     crop = _cropped(bench)
@@ -332,7 +339,7 @@ def _dimensions(bench: Bench) -> Measured:
 
 
 def _summed(bench: Bench) -> DirectlySummed:
-    """Image of points at rest by the bands that are reconstructed for known motion."""
+    """Image of points at rest with the bands that are reconstructed for known motion."""
     radar, size = bench.radar, _cropped(bench)
     gate, pulses, samples = size["gate"], size["pulses"], _LINES
 

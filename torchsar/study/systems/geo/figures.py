@@ -19,7 +19,7 @@ from torchsar.study.systems.geo.judge import PeakCuts
 from torchsar.study.trials.batch import Result
 from torchsar.study.trials.cuts import about_peak, finer
 
-# lowest levels of profiles and of spectra
+# lowest drawn levels of profiles and of spectra
 _LOW_DB, _SPECTRUM_DB = -90.0, -70.0
 
 
@@ -80,7 +80,9 @@ def by_target(results: Mapping[str, Result]) -> dict[str, Any]:
 
 
 def _pair(result: Result) -> Shots:
-    """The conventional and the recommended method, or the first two where they are missing."""
+    """Images of the conventional and the recommended method, or of the first two methods if these
+    are missing.
+    """
     found = shots(result)
     chosen = [name for name in ("conventional", "recommended") if name in found] or list(found)[:2]
     return {name: found[name] for name in chosen}
@@ -129,7 +131,7 @@ def _main_lobes(result: Result) -> Drawn:
 
 
 def _contours(result: Result) -> Drawn:
-    """Two-dimensional images about their peaks, if there are any."""
+    """Draw two-dimensional images around their peaks, if there are any."""
     found = _pair(result)
     images = {
         f"{target}, {name}": of[target].image for target in next(iter(found.values()), {}) for name, of in found.items()
@@ -144,8 +146,10 @@ def _contours(result: Result) -> Drawn:
 
 
 def _about_peak(image: Signal) -> Signal:
-    """The part about the peak, +-6 m in azimuth and +-20 m in range on a grid of 161 samples;
-    offsets from the peak, range halved.
+    """Part of an image around its peak, +-6 m in azimuth and +-20 m in range on a grid of 161
+    samples.
+
+    The axes give offsets from the peak; those in range are halved.
     """
     part = about_peak(image, (6.0, 40.0), 161)
     range_ = part.axes[1]

@@ -21,9 +21,10 @@ from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.reconstruct import Reconstruct, condition_number, noise_gain_db
 from torchsar.radar import BistaticRadar
 
-# symbols of the unknowns, by their names in truth and estimates
+# symbols of the unknowns, by their names in true values and estimates
 UNKNOWNS = {"u_r_m_s": "u_r", "u_a_m_s": "u_a", "y0_m": "y0"}
-# of a sinc: -3 dB width in null spacings, and side lobes by 20 nulls to either side
+# properties of a sinc: -3 dB width over the spacing of its nulls, and levels of the side lobes up
+# to 20 nulls to either side
 _WIDTH, _PSLR_DB, _ISLR_DB = 0.8859, -13.26, -9.92
 
 
@@ -152,7 +153,7 @@ class FocusedPoint:
 
 
 def _given(chain: Chain, stage: str, trace: Trace, radar: BistaticRadar) -> PointMotion:
-    """The motion that a stage of a chain worked with, (row,)."""
+    """Motion (row,) that a stage of a chain used."""
     values = {key: value for key, value in trace.arguments[stage].items() if key in UNKNOWNS}
     data, rows = trace.inputs[stage].data, trace.inputs[stage].trials
     motion = PointMotion.of(radar, data, **values, range_m=getattr(chain.stages[stage], "range_m", None))
@@ -262,7 +263,9 @@ def _false_targets(
     integration_s: Tensor | float | None,
     orders: int,
 ) -> Tensor:
-    """Level (row,) of the largest replica, NaN for images too short to hold any."""
+    """Level (row,) of the largest replica. It is NaN for images that are too short to
+    contain any.
+    """
     radar, used = focused.rebuild.radar, focused.focused_for
     given = {"integration_s": integration_s, "focused_at": (used.u_r_m_s, used.u_a_m_s), "orders": range(1, orders + 1)}
     true = (truth[key] for key in (*UNKNOWNS, "range_m"))

@@ -210,7 +210,7 @@ class Points(World):
         A row is one target in one trial; the rows of a trial follow each other.
         """
         rows, count = _row_draws(draws, self.targets), len(draws.trials or (0,))
-        own: Points = repeated(self, len(self.targets))  # each row has the numbers of its trial
+        own: Points = repeated(self, len(self.targets))  # each row has the values of its trial
         level = own.snr_db(radar)
         snr = None if level is None else torch.as_tensor(level, dtype=torch.float64).expand(len(rows.trials or ()))
         transmit = None if own.transmit_range is None else PolynomialTransmit(own.transmit_range)
@@ -261,7 +261,7 @@ def compression_gain_db(radar: BistaticRadar) -> float:
 
 
 def _row_draws(draws: Draws, names: Mapping[str, Target]) -> Draws:
-    """One address for each trial and target, trials outermost; the random numbers of a target do
+    """One address for each trial and target, trials outermost. The random numbers of a target do
     not depend on other targets.
     """
     rows = [(f"{case}/{name}", trial) for case, trial in draws.addresses for name in names]

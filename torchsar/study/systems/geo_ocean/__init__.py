@@ -98,7 +98,7 @@ class Frame:
     images: dict[tuple[Rebuild, str], Signal] = field(default_factory=dict)
 
     def still_image(self, stage: StationaryImage) -> Signal:
-        """Return the image of what does not move, made by the imaging stage of a method."""
+        """Return the image of the scene at rest, made by the imaging stage of a method."""
         kind = (stage.rebuild, stage.form)
         if kind not in self.images:
             self.images[kind] = stage(self.still)
@@ -148,7 +148,8 @@ class Ocean(World):
         Returns:
             Recordings and true values; `own` holds one `Frame` for each trial.
         """
-        # every trial is a case of its own, so that a scene has one address for all that it draws
+        # every trial is a case of its own, so that a scene has one address for all its random
+        # numbers
         cases = tuple(f"{case}/{trial}" for case, trial in draws.addresses)
         scenes = replace(draws, case=cases, trials=[0] * len(cases))
         fleet = Fleet({name: vessel.points() for name, vessel in self.targets.items()})
@@ -187,14 +188,16 @@ class Ocean(World):
 
 
 def _ship(radar: BistaticRadar, motion: PointMotion, movers: Movers, echo: Signal, i: int) -> Ship:
-    """One ship of one trial, with the centre of its scatterers' powers."""
+    """Ship of one trial, with the centroid of the powers of its scatterers."""
     power = movers.amplitude[i].abs().square()
     centre = [(power * x[i]).sum() / power.sum() for x in (movers.y0_m, movers.closest_m(radar))]
     return Ship(motion.each(lambda x: x[i]), (float(centre[0]), float(centre[1])), Signal(echo.data[i], echo.axes))
 
 
 def _truth(ships: Mapping[str, list[Ship]], frames: list[Frame]) -> dict[str, Tensor]:
-    """Motions of the middles (trial, ship), and of each ship's intensity centroid, (trial,)."""
+    """Motions of the middles of the ships (trial, ship), and motion of the intensity centroid of
+    each ship, (trial,).
+    """
     middles = {
         key: torch.stack([torch.stack([getattr(s.motion, key) for s in of]) for of in ships.values()], -1)
         for key in TRUTHS
@@ -227,9 +230,10 @@ class Judging:
 
 
 class View(NamedTuple):
-    """What pictures need of a method: images of every trial, detected targets by ship, and the
-    channels of the first trial after each stage that changes them, once the transmit range is
-    removed.
+    """Data of a method that pictures need.
+
+    They are the images of every trial, the detected targets by ship, and the channels of the first
+    trial after each stage that changes them, from the removal of the transmit range on.
     """
 
     made: Sequence[MadeScene]
@@ -407,19 +411,19 @@ class GeoOcean(System):
 
 
 def _extraction(bench: Bench) -> Extraction:
-    """Extraction of the recommended method, which also images the echoes of single ships."""
+    """Settings of the extraction by the recommended method, which also images single ships."""
     _, last = last_stage(bench.chains["recommended"])
     return last.flow.extraction if isinstance(last, MoversImage) else Extraction()
 
 
 def _stacked(rows: Sequence[Mapping[str, float]]) -> dict[str, Tensor]:
-    """Metrics of several trials by name; NaN where a trial does not have one."""
+    """Metrics of several trials by name. They are NaN where a trial does not have a metric."""
     names = dict.fromkeys(name for row in rows for name in row)
     return {n: torch.tensor([row.get(n, math.nan) for row in rows], dtype=torch.float64) for n in names}
 
 
 def _conditioning(radar: BistaticRadar, stage: StationaryImage) -> dict[str, Tensor]:
-    """Condition number and noise gain of the reconstruction of what is at rest."""
+    """Condition number and noise gain of the reconstruction of the scene at rest."""
     motion = PointMotion.of(radar, torch.zeros((), dtype=torch.float64))
     gain = {"noise_gain_db": noise_gain_db(radar, motion, stage.rebuild)}
     if not isinstance(stage.rebuild, LeastSquares):

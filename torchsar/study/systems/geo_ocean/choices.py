@@ -1,4 +1,4 @@
-"""Processing of ships on a sea: its limits, what simplifications neglect, and its alternatives."""
+"""Processing of ships on a sea: its limits, the errors of simplifications, and its alternatives."""
 
 from __future__ import annotations
 
@@ -33,14 +33,15 @@ from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Alternative, Choice, Measured
 from torchsar.study.trials.system import by_limit
 
-# integration time (s) of the source, for scenes that are seen through a pattern
+# integration time (s) of the source, for scenes that are illuminated through an antenna pattern
 _PATTERN_S = 4.5
-# pulses and range lines about one ship, on which the settings of the flow are compared: they hold
-# 1.8 apertures of 4.5 s at 180 Hz, and the walk of a ship of 20 m/s
+# Pulses and range lines around one ship on which the settings of the recommended method are
+# compared. They contain 1.8 apertures of 4.5 s at 180 Hz, and the range walk of a ship at 20 m/s.
 _CROP = (1440, 128)
-# segments (s) of slow time and half extents (m) of the lines of a ship that are compared
+# segments (s) of slow time, and half extents (m) of the lines of a ship, that are compared
 _SEGMENTS_S, _LINES_M = (0.3, 0.6, 1.2), (30.0, 60.0)
-# no keystone transform is used, and bands are separated only for what is at rest
+# limits that do not apply, because no keystone transform is used, and bands are separated only for
+# the scene at rest
 _NOT_HERE = (
     "tone left for the keystone transform",
     "condition number within the velocities",
@@ -55,8 +56,8 @@ def limits(bench: Bench) -> dict[Limit, list[str]]:
 
 
 def requirements(bench: Bench) -> Sequence[Requirement]:
-    """Return what simplified processing neglects; nothing if a target is as fast along track as the
-    receiver, since no aperture forms then.
+    """Return the errors of simplified processing; nothing if a target is as fast along track as the
+    receiver, because no aperture forms then.
     """
     use = _use_of(bench, "recommended")
     return multichannel_requirements(bench.radar, use) if bench.radar.speed_m_s > use.u_a_m_s[1] else ()
@@ -72,8 +73,10 @@ def _integration_s(bench: Bench) -> float | None:
 
 
 def _use_of(bench: Bench, name: str) -> MultichannelUse:
-    """How a method uses the radar: what is at rest it rebuilds as such, moving ships it images by
-    their own velocities without any reconstruction.
+    """Use of the radar by a method.
+
+    The scene at rest is reconstructed as such. Moving ships are imaged with their own velocities,
+    without a reconstruction.
     """
     world, last, lit = bench.world(), _last(bench, name), _integration_s(bench)
     ships, moving = list(world.targets.values()), isinstance(last, MoversImage)
@@ -94,7 +97,9 @@ def _use_of(bench: Bench, name: str) -> MultichannelUse:
 
 
 def _swath_limits(bench: Bench, name: str) -> list[Limit]:
-    """Moving ships are sought only where they lie in the swath at any velocity."""
+    """Limits of the swath. Moving ships are sought only where they lie in the swath at any
+    velocity.
+    """
     last, world = _last(bench, name), bench.world()
     if not isinstance(last, MoversImage):
         return []
@@ -104,8 +109,8 @@ def _swath_limits(bench: Bench, name: str) -> list[Limit]:
 
 
 def choices(bench: Bench) -> list[Choice]:
-    """Return the choices between alternatives: the form of focusing for what is at rest, and the
-    settings by which the recommended method images moving ships.
+    """Return the choices between alternatives: the form of focusing for the scene at rest, and the
+    settings with which the recommended method images moving ships.
     """
     radar, world, lit = bench.radar, bench.world(), _integration_s(bench) or _PATTERN_S
     lost = bulk_error_db(radar, _rebuild(bench).bands, world.samples / 2 * radar.range_step_m, lit)
@@ -125,13 +130,15 @@ def choices(bench: Bench) -> list[Choice]:
 
 
 def _rebuild(bench: Bench) -> Any:
-    """The reconstruction of what is at rest by the recommended method."""
+    """Reconstruction of the scene at rest by the recommended method."""
     last = _last(bench, "recommended")
     return (last.flow.image if isinstance(last, MoversImage) else last).rebuild
 
 
 def _forms(bench: Bench) -> Measured:
-    """Images of points at rest at both edges of the swath by each form, against the exact one."""
+    """Measure the error of images of points at rest at both edges of the swath by each form,
+    relative to the exact one.
+    """
     radar, world, rebuild = bench.radar, bench.world(), _rebuild(bench)
     axes = radar.axes(world.pulses, world.samples)
     edge = 0.9 * world.samples / 2 * radar.range_step_m
@@ -139,7 +146,7 @@ def _forms(bench: Bench) -> Measured:
     echo = bistatic_echo(
         points.movers(radar, Draws(0)), radar, world.pulses, world.samples, gate=world.gate, dtype=torch.complex128
     )
-    # the transmit range is common to everything, and left out
+    # the transmit range is common to all echoes, and is removed
     signal = RemoveTransmitRange(radar)(Signal(echo, axes))
     exact, used = StationaryImage(radar, rebuild)(signal).data, signal.to(bench.dtype)
 
@@ -150,9 +157,10 @@ def _forms(bench: Bench) -> Measured:
 
 
 def _flows(bench: Bench) -> Measured:
-    """The recommended flow with one setting changed at a time, on the fastest ship alone.
+    """Measure the recommended method with one setting changed at a time, on the fastest ship only.
 
-    The swath about the ship keeps its range, so that the data are a crop of the whole scene.
+    The range of the swath around the ship is kept, so that the data are a part of those of the
+    whole scene.
     """
     flow, world = _last(bench, "recommended").flow, bench.world()
     name, ship = max(world.targets.items(), key=lambda item: _speed_m_s(item[1]))

@@ -17,7 +17,7 @@ from torchsar.study.output.report import Drawn
 from torchsar.study.systems.geo_ocean.judge import ImagePosition, MadeScene, ShownShip, at_rest
 from torchsar.study.trials.batch import Result
 
-# highest and lowest level of drawn scenes over the sea (dB)
+# highest and lowest level (dB) of drawn scenes relative to the sea
 _UP_DB, _DOWN_DB = 25.0, -10.0
 
 
@@ -35,7 +35,9 @@ def _true(shown: ShownShip) -> ImagePosition:
 
 
 def _over_sea(image: Signal) -> Signal:
-    """Root mean square of blocks relative to the median block, limited to the drawn levels."""
+    """Root mean square of blocks of pixels relative to the median block, limited to the drawn
+    levels.
+    """
     view = plot.quicklook(image, 300)
     level = view.data.abs().to(torch.float64)
     level = level / level.median().clamp_min(1e-300)
@@ -43,13 +45,15 @@ def _over_sea(image: Signal) -> Signal:
 
 
 def _boxes(positions: Sequence[ImagePosition]) -> tuple[np.ndarray, np.ndarray]:
-    """Outlines +-60 m in range and +-120 m in azimuth about positions as one broken line."""
+    """Outlines of +-60 m in range and +-120 m in azimuth around positions, as one broken line."""
     return plot.boxes([(p.range_m, p.azimuth_m) for p in positions], 60.0, 120.0)
 
 
 def _marked(result: Result, title: str, image: Signal, apparent: bool) -> dict[str, Any]:
-    """An image with outlines about the true positions of ships, and about their positions and
-    replicas in an image focused for a stationary scene.
+    """Image with outlines of ships.
+
+    They mark true positions, and if `apparent` also positions and replicas in an image focused for
+    a stationary scene.
     """
     ships = list(_shown(result).values())
     lines = {"true position": _boxes([_true(one) for one in ships])}
@@ -61,10 +65,10 @@ def _marked(result: Result, title: str, image: Signal, apparent: bool) -> dict[s
 
 
 def _steps(result: Result) -> dict[str, Signal]:
-    """Images of what each step of the recommended method before the detection of ships leaves.
+    """Images after each step of the recommended method before the detection of ships.
 
-    A step is a stage that changes the channels, from the removal of the transmit range on, without
-    which nothing is focused. The last image is that of all channels. Before it is the one of a
+    A step is a stage that changes the channels, from the removal of the transmit range on, because
+    nothing is focused before. The last image is that of all channels. Before it is the image of a
     single channel, whose Doppler bands overlap.
     """
     chain, view = result.bench.chains["recommended"], result.first.outcomes["recommended"].judged.view

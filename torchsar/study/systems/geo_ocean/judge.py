@@ -18,8 +18,10 @@ from torchsar.multichannel.stationary import StationaryImage
 from torchsar.radar import BistaticRadar
 from torchsar.study.trials.batch import last_stage
 
-# half extents in azimuth and range, in metres, in which levels are measured: the sea about a ship,
-# the ship itself, a replica; and in which a ship and its blurred replicas are sought
+# Half extents in azimuth and range, in metres.
+# NEAR_M, SHIP_M, REPLICA_M: areas in which the levels of the sea around a ship, of the ship itself,
+# and of a replica are measured.
+# _SHOWN_M, _SPREAD_M: areas in which a ship and its blurred replicas are sought.
 NEAR_M, SHIP_M, REPLICA_M = (400.0, 30.0), (60.0, 12.0), (100.0, 40.0)
 _SHOWN_M, _SPREAD_M = (250.0, 60.0), (150.0, 110.0)
 # speeds |u_r| and |u_a| in m/s up to which a ship counts as at rest, as in `ImageMovers`
@@ -116,7 +118,7 @@ class Ship:
 
     @property
     def moves(self) -> bool:
-        """Whether the ship moves at more than 0.3 m/s in range or 1 m/s along track."""
+        """True if the ship moves at more than 0.3 m/s in range or 1 m/s along track."""
         fast = (self.motion.u_r_m_s.abs() > _SLOWEST_M_S[0], self.motion.u_a_m_s.abs() > _SLOWEST_M_S[1])
         return any(map(bool, fast))
 
@@ -188,8 +190,9 @@ class ShownShip:
 
 
 def _repeated(image: Signal, shown: ImagePosition, off_m: float) -> ImagePosition:
-    """Where a replica lies off_m to either side of the image itself, on the side where it is
-    stronger: it is wide in range, since its migration is that of another band.
+    """Position of the replica off_m to the side of the ship on which it is stronger.
+
+    A replica is wide in range, because its migration is that of another band.
     """
     sides = [replace(shown, azimuth_m=shown.azimuth_m + side * off_m) for side in (-1, 1)]
     return max(sides, key=lambda position: position.power(image, _SPREAD_M)).centroid(image, _SPREAD_M)
@@ -228,7 +231,7 @@ class MadeScene:
 
 
 def at_rest(chain: Chain) -> StationaryImage:
-    """The stage of a chain that images what is at rest."""
+    """Stage of a chain that images the scene at rest."""
     _, last = last_stage(chain)
     return last.flow.image if isinstance(last, MoversImage) else last
 
@@ -342,8 +345,8 @@ def _levels(shown: ShownShip, made: MadeScene, still: Signal) -> dict[str, float
     """
 
     def of_lines(at: ImagePosition, reach_m: float) -> float:
-        """Mean power in the image of what does not move, over all azimuths within reach_m in
-        range.
+        """Mean power in the image of the scene at rest, over all azimuths within reach_m
+        in range.
         """
         return at.power(still, (math.inf, reach_m))
 

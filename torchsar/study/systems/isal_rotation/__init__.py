@@ -31,7 +31,7 @@ from torchsar.study.trials.system import Column, System, named_points
 
 @dataclass(frozen=True)
 class OneScene:
-    """A random scene with a seed of its own, the same in every trial."""
+    """A random scene with its own seed, which is the same in every trial."""
 
     scene: Scene
     seed: int
@@ -95,7 +95,7 @@ class Rotating(Target):
         return math.sqrt(float(amplitude.abs().square().sum()) / self.samples) * 10 ** (-float(snr_db) / 20)
 
 
-# limits that concern only methods which estimate the value
+# limits that concern only methods that estimate the named value
 _OF_ESTIMATORS = {"scatterers above the noise": "warp_k", "range term, pi lambda sigma_y / ra^2": "omega_rad_s"}
 
 
@@ -291,8 +291,8 @@ def _expanded(metrics: Mapping[str, Tensor], count: int) -> dict[str, Tensor]:
 def _scale_rate(
     found: FoundRotation, truth: Mapping[str, Tensor], duration_s: float, assumed: float | None, count: int
 ) -> Tensor:
-    """Mean rate (trial,) that scales images to metres: the estimated one, else the assumed one of
-    the radar, else the true one.
+    """Mean rotation rate (trial,) that scales images to metres: the estimated rate, or otherwise
+    the assumed rate of the radar, or otherwise the true rate.
     """
     other = truth["rotation_rad_s"] if not assumed else torch.full_like(truth["rotation_rad_s"], assumed)
     own = found.rate(duration_s)
@@ -300,7 +300,7 @@ def _scale_rate(
 
 
 def _looks_for_centre(bench: Bench) -> bool:
-    """Whether any estimator of the config estimates the range centre deviation."""
+    """True if any estimator of the config estimates the range centre deviation."""
     stages = (stage for chain in bench.chains.values() for stage in chain.stages.values())
     return any(getattr(s, "yc_m", 0.0) is None and "yc_m" in getattr(s, "provides", ()) for s in stages)
 

@@ -1,4 +1,6 @@
-"""Processing of a rotating target: its limits, what simplifications neglect, its alternatives."""
+"""Processing of a rotating target: its limits, the errors of simplifications, and its
+alternatives.
+"""
 
 from __future__ import annotations
 
@@ -37,11 +39,12 @@ from torchsar.study.trials.choice import (
 )
 from torchsar.study.trials.system import Noise
 
-# orders of the rotation that are compared, and more where the target has more
+# number of orders of the rotation that are compared; there are more if the rotation of the target
+# has more
 _ORDERS = 4
-# lines so fine that a peak between two of them loses less than 0.01 dB
+# image lines that are so fine that a peak between two of them loses less than 0.01 dB
 _FINE = DopplerLines(16.0)
-# estimators that start near the truth, by name
+# names of estimators that start near the truth
 _DESCENT, _GENETIC = "descent from 0.95 of the truth", "genetic 10 x 4, +-10 % about the truth"
 
 
@@ -52,13 +55,13 @@ def limits(bench: Bench) -> tuple[Limit, ...]:
     omega, k, yc = _rotation(world)
     std = world.noise_std(amplitude)
     known = {"wavelength_m": radar.wavelength_m, "prf_hz": radar.prf_hz, "n_pulse": world.pulses, "free_centre": False}
-    # the centre known: with a free one the bound is larger where the ranges are few
+    # the bound is that for a known centre; with a free centre, it is larger if there are few ranges
     bound = float(rotation_bounds(x, y, amplitude, std, omega, k, yc, **known)["omega_rad_s"]) if std > 0 else None
     return rotation_limits(radar, world.pulses, omega, k.tolist(), x, y + yc, amplitude, std, bound)
 
 
 def requirements(bench: Bench) -> Sequence[Requirement]:
-    """Return what each simplified processing neglects for the target in the first trial."""
+    """Return the errors of each simplified processing for the target in the first trial."""
     x, y, _ = _scatterers(bench)
     omega, k, yc = _rotation(bench.world())
     reach = (float(x.abs().max()), float((y + yc).abs().max()))
@@ -70,7 +73,7 @@ def choices(bench: Bench) -> list[Choice]:
     transform along slow time, estimator of the rotation, and echo model.
     """
     orders = [_order(order, bench) for order in range(1, max(_ORDERS, 1 + len(_rotation(bench.world())[1])) + 1)]
-    # largest width of kernels that are compared
+    # largest width of the kernels that are compared
     kernels = {f"gridding, {taps} taps": Gridding(taps=taps) for taps in (2, 3, 4, 5, 6, 7, 8)}
     transforms = [
         *(
@@ -111,7 +114,9 @@ def choices(bench: Bench) -> list[Choice]:
 
 
 def _order(order: int, bench: Bench) -> Alternative:
-    """The rotation cut to an order, and what the outermost scatterer loses."""
+    """Alternative with the rotation truncated to an order, and the loss of the outermost
+    scatterer.
+    """
     (omega, k, _), world, radar = _rotation(bench.world()), bench.world(), bench.radar
     lost, across = {}, float(_scatterers(bench)[0].abs().max())
     if order <= min(len(k), _ORDERS):
@@ -121,7 +126,7 @@ def _order(order: int, bench: Bench) -> Alternative:
 
 
 def _aliased(one: Gridding) -> dict[str, float]:
-    """Predicted error of gridding: that of its kernel, and rounding of single precision."""
+    """Predicted error of gridding: that of its kernel, and rounding errors of single precision."""
     return {"image_error_db": 20 * math.log10(math.hypot(one.kernel.error, torch.finfo(torch.float32).eps))}
 
 
@@ -132,7 +137,7 @@ def _scatterers(bench: Bench) -> list[Tensor]:
 
 
 def _rotation(world: Any) -> tuple[float, Tensor, float]:
-    """Rate, k1, k2, ... and range centre deviation of the first trial."""
+    """Rotation rate, k1, k2, ... and range centre deviation of the first trial."""
     omega, yc = (
         float(torch.as_tensor(v).reshape(-1)[0]) for v in (world.rotation.omega_rad_s, world.centre_deviation_m)
     )
@@ -141,7 +146,9 @@ def _rotation(world: Any) -> tuple[float, Tensor, float]:
 
 
 def _levers(bench: Bench) -> tuple[float, float]:
-    """Largest distances (m) of scatterers from the centre of rotation, and from range cells."""
+    """Largest distances (m) of scatterers from the centre of rotation, and from the middles of
+    range cells.
+    """
     y, cell = _scatterers(bench)[1], bench.radar.range_step_m
     return float((y + _rotation(bench.world())[2]).abs().max()), float((y - cell * (y / cell).round()).abs().max())
 
@@ -175,7 +182,9 @@ def _without_range_term(bench: Bench, trials: Trials) -> Tensor:
 def _peak_losses(
     bench: Bench, target: int, best: Alternative, made: Callable[[Trials, Alternative], tuple[Tensor, Tensor]]
 ) -> Measured:
-    """Loss of the peak of one scatterer; `made` gives the data and the warp of an alternative."""
+    """Measure the loss of the peak of one scatterer. `made` returns the data and the warp of an
+    alternative.
+    """
     (x, y, _), prf = _scatterers(bench), bench.radar.prf_hz
     alone, whole = _alone(bench, float(y[target]), float(x[target])), bench.trials(_draws(bench))
 
@@ -190,7 +199,7 @@ def _peak_losses(
 
 
 def _orders(bench: Bench) -> Measured:
-    """Images of the outermost scatterer by the true rotation cut to each order."""
+    """Measure images of the outermost scatterer with the true rotation truncated to each order."""
 
     duration_s = bench.world().pulses / bench.radar.prf_hz
 
@@ -202,7 +211,7 @@ def _orders(bench: Bench) -> Measured:
 
 
 def _range_terms(bench: Bench) -> Measured:
-    """Images of the scatterer farthest from the centre with and without its range term."""
+    """Measure images of the scatterer farthest from the centre with and without its range term."""
 
     def made(trials: Trials, one: Alternative) -> tuple[Tensor, Tensor]:
         data = trials.clean.signal.data
@@ -217,10 +226,10 @@ def _range_terms(bench: Bench) -> Measured:
 
 
 def _transforms(bench: Bench) -> Measured:
-    """The matched Fourier transform of whole trials by each transform."""
+    """Measure each way to compute the matched Fourier transform on whole trials."""
     trials = bench.trials(_draws(bench))
     exact, k = _without_range_term(bench, trials).to(torch.complex128), trials.truth["warp_k"]
-    # products of pulses, lines and range cells up to which the sum itself is the yardstick
+    # the sum itself is the reference up to this number of products of pulses, lines and range cells
     best = ExplicitSum() if 2 * exact.numel() * exact.shape[-2] <= 3e8 else Gridding(eps=1e-12, oversampling=2.0)
     truth, data = matched_fourier(exact, k, bench.radar.prf_hz, transform=best), exact.to(bench.dtype)
 
@@ -239,7 +248,7 @@ def _summed(bench: Bench) -> DirectlySummed:
     (omega, k, yc), radar, world, lines = _rotation(bench.world()), bench.radar, bench.world(), DopplerLines()
     range_m, count = radar.raw_axes(world.pulses, world.samples)[1].values(), lines.number(world.pulses)
     phi = warp(torch.arange(world.pulses + 1, dtype=torch.float64) / radar.prf_hz, k)
-    # lines lie at equal steps of the Doppler at the mean rate
+    # lines lie at equal steps of Doppler at the mean rate
     doppler = (torch.arange(count, dtype=torch.float64) - count // 2) / (lines.oversampling * phi[-1])
     cross = radar.wavelength_m * doppler / (2 * omega)
     about = (range_m, radar.wavelength_m, radar.prf_hz, omega, k, yc)
@@ -285,7 +294,7 @@ _ESTIMATORS: dict[str, Callable[..., Estimate]] = {
 
 
 def _estimates(bench: Bench) -> Measured:
-    """Estimators on the config's own trials, without errors of phase."""
+    """Measure the estimators on the trials of the config, without phase errors."""
     trials, radar = bench.trials(_draws(bench)), bench.radar
     signal, truth = trials.clean.signal, trials.truth
     stages = (bench.config.processor["recommended"].stages or {}).values()
@@ -299,7 +308,7 @@ def _estimates(bench: Bench) -> Measured:
 
     def loss(one: Alternative, estimate: Estimate) -> dict[str, float]:
         rows = {}
-        if one.name != "coarse":  # which does not look at the rate
+        if one.name != "coarse":  # the coarse estimator does not use the rate
             rows["omega_error_percent"] = rms(100 * (estimate["omega_rad_s"] / truth["omega_rad_s"] - 1))
         for i, k in enumerate(truth["warp_k"].unbind(-1)[:2]):
             if bool((k != 0).all()):

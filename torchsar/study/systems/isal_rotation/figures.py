@@ -12,7 +12,8 @@ from torchsar.study.output.report import Drawn, first_named
 from torchsar.study.systems.isal_rotation.judge import CrossRangeCut
 from torchsar.study.trials.batch import Result
 
-# targets of fewer scatterers are points, of which cuts show more than an enlarged picture
+# A target of fewer scatterers consists of points. Cuts through these show more than an enlarged
+# picture.
 _MANY = 20
 
 
@@ -31,7 +32,7 @@ def _in_metres(result: Result) -> dict[str, Signal]:
 def _images(result: Result) -> Drawn:
     along, across = result.first.trials.first("range_m", "cross_range_m")
     images = _in_metres(result)
-    # more than the cross range of the target; beside points their responses are shown
+    # more than the cross range of the target, so that the responses of points are visible
     reach = (1.15 if len(across) >= _MANY else 1.5) * float(across.abs().max())
     margin = next(iter(images.values())).axes[1].step
     shown = _parts(images, (-reach, reach), plot.span(along, margin))
@@ -45,8 +46,8 @@ def _images(result: Result) -> Drawn:
 
 
 def _end(result: Result, part: float = 0.2) -> Drawn:
-    """Draw the end of the target with the outermost scatterer, as in Figs 5 to 9 of the source:
-    this part of its half width.
+    """Draw the end of the target with the outermost scatterer, as in Figs 5 to 9 of the source: the
+    part `part` of its half width.
     """
     along, across = result.first.trials.first("range_m", "cross_range_m")
     if len(across) < _MANY:
@@ -85,8 +86,9 @@ def _slices(result: Result) -> Drawn:
 
 
 def _panels(target: str, cuts: Mapping[str, CrossRangeCut], beside: int = 4) -> list[dict[str, Any]]:
-    """Panels of one target, each with the first method and an equal share of the others, at most
-    `beside`, over 25 widths of the response to either side.
+    """Panels of one target, over 25 widths of the response to either side.
+
+    Each panel has the first method and an equal share of the others, at most `beside`.
     """
     first, *others = cuts
     top, width = (float(cuts[first].figures[key][0]) for key in ("peak", "irw_azimuth_m"))

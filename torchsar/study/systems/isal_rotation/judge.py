@@ -13,9 +13,10 @@ from torchsar.compensate.rotation.image_entropy import k_name
 from torchsar.core import Chain, Estimate, Signal, unit_phasor
 from torchsar.focus.image_lines import mean_rate
 
-# the usual -3 dB, as a ratio of powers
+# level at which the width is measured, -3 dB as a ratio of powers
 _HALF_POWER = 10 ** (-3.0 / 10)
-# chosen: points of a cut per line of the image, and lines beside it that keep its ends undisturbed
+# points of a cut per line of the image, and lines beside it that keep its ends undisturbed, by
+# choice
 _FINER, _MARGIN = 8, 64
 
 
@@ -192,9 +193,11 @@ class CrossRangeCut:
         }
 
     def _reach(self, power: Tensor, top: Tensor, peak: Tensor, side: int) -> tuple[Tensor, Tensor]:
-        """Fractional index of half power and index of the first minimum to one side, (trial, 1)."""
+        """Fractional index of half power, and index of the first minimum, on one side of the peak,
+        (trial, 1).
+        """
         n, index = power.shape[-1], torch.arange(power.shape[-1], device=power.device)
-        before = power.roll(side, -1)  # the neighbour towards the peak
+        before = power.roll(side, -1)  # level of the neighbour towards the peak
         beyond, last = (index - top) * side > 0, n if side > 0 else -1
         edge = torch.where(self.inside, index, 0 if side > 0 else n - 1)
         edge = edge.amax(-1, keepdim=True) if side > 0 else edge.amin(-1, keepdim=True)
@@ -242,7 +245,7 @@ def cross_range_cut(
     middle = ((x_m - start) / step).round().long()
     reach = (search_m / step).ceil().long()
     first, last = (middle - reach).clamp(0, n), (middle + reach + 1).clamp(0, n)
-    # fewer lines than this do not show a main lobe with its side lobes
+    # fewer lines than this do not contain a main lobe with its side lobes
     if not bool((last - first >= 8).all()):
         return None
     longest = int((last - first).max())

@@ -128,8 +128,8 @@ class Ground(World):
 
     @property
     def named_points(self) -> dict[str, int]:
-        """Names `part.number` of point targets and retro-reflectors, whose responses are measured,
-        and their indices among all scatterers.
+        """Names `part.number` of the point targets and retro-reflectors whose responses are
+        measured, and their indices among all scatterers.
         """
         return named_points(self.scene, {Points: None, RetroAndBrokenLine: 1})
 
@@ -248,7 +248,8 @@ class Sal(System):
             before: list[str] = []
             for key, entry in (method.stages or {}).items():
                 stage, times = entry["stage"], before.count("deramp_azimuth")
-                # these work on deramped profiles, but cannot check whether their input is deramped
+                # these stages process deramped profiles, but cannot check whether their input is
+                # deramped
                 if (
                     stage in ("azimuth_matched_filter", "phase_polish")
                     and times != 1
@@ -339,7 +340,7 @@ class Sal(System):
 def _expanded(
     metrics: Mapping[str, Tensor], targets: Mapping[str, Any], outside: Sequence[str], course: Course, count: int
 ) -> Judged:
-    """Metrics with one entry per trial, also where trials share their value."""
+    """Expand metrics to one entry per trial, also if all trials have the same value."""
     rows = {name: {key: value.expand(count) for key, value in of.items()} for name, of in targets.items()}
     return Judged({key: value.expand(count) for key, value in metrics.items()}, rows, outside, course)
 

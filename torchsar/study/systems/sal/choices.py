@@ -1,4 +1,4 @@
-"""Limits of ladar methods, what echo models neglect, and how models and estimators compare."""
+"""Limits of ladar methods, errors of echo models, and comparisons of models and estimators."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Alternative, Choice, DirectlySummed, Measured, beside_direct_sum, ladar_strip
 from torchsar.study.trials.system import Noise
 
-# limits that stop only methods with such a stage, whose key has that value
+# limits that concern only methods with a stage whose key has the given value
 _CONCERNS = {
     "SNR after compression": ("segmented_interference", "unwrap", "gradient"),
     "spacing of scatterers": ("segmented_interference", "bins", "peak"),
-    "speed of the mirror tone": ("", "", ""),  # estimators take the bulk of the velocity out first
+    "speed of the mirror tone": ("", "", ""),  # estimators remove most of the velocity first
 }
-# echo models, the cheapest first: level, effect that is left out, row of the requirements
+# echo models, the cheapest first: level of detail, effect that is left out, row of the requirements
 _MODELS = (
     ("one_per_period", "", "one range per period"),
     ("one_per_sweep", "", "one range per sweep"),
@@ -96,7 +96,7 @@ def _concerns(limit: Limit, name: str, bench: Bench) -> bool:
 
 
 def requirements(bench: Bench) -> Sequence[Requirement]:
-    """Return what simplified echo models and motion compensation neglect in this scene."""
+    """Return the errors of simplified echo models and of motion compensation in this scene."""
     e = _moved(bench).extremes
     motion = (e.velocity_m_s, e.acceleration_m_s2, e.displacement_m)
     return ladar_requirements(bench.radar, bench.world().periods, e.range_m, *motion)
@@ -113,7 +113,7 @@ def choices(bench: Bench) -> list[Choice]:
         "radial motion": radial_motion,
     }
     found = [Alternative(name, {"estimator": work}) for name, work in estimators.items()]
-    # a continuous record knows no single range of a sweep
+    # in a continuous record, a sweep has no single range
     possible = [entry for entry in _MODELS if bench.world().record is None or not entry[0].startswith("one_per")]
     seen = _moved(bench)
     models = [_model(bench, seen, *entry) for entry in possible]
@@ -140,10 +140,12 @@ def _model(bench: Bench, seen: Moved, kind: str, without: str, row: str) -> Alte
 
 
 def _echoes(bench: Bench, seen: Moved) -> Measured:
-    """Echoes of the farthest scatterer alone by each model, each with its own complex gain."""
+    """Measure the echoes of the farthest scatterer by each model, each with its best
+    complex gain.
+    """
     world, nothing = bench.world(), {"impairments": {}, "record": None, "sweep_error": None, "log_amplitude": None}
     alone = replace(world, scene={"edge": seen.farthest}, noise=Noise(), **nothing)
-    draws = bench.draws("run", [0])  # whose motion is predicted
+    draws = bench.draws("run", [0])  # draws of the trial whose motion is predicted
 
     def made(of: Any, keys: Mapping[str, Any], dtype: torch.dtype) -> Tensor:
         trials = replace(of, fidelity=_fidelity(keys)).trials_of(bench.radar, draws, dtype)
@@ -158,7 +160,9 @@ def _echoes(bench: Bench, seen: Moved) -> Measured:
 
 
 def _estimates(bench: Bench) -> Measured:
-    """Estimators alone, in the window of the recommended method, on the config's own trials."""
+    """Measure single estimators, in the range window of the recommended method, on the trials of
+    the config.
+    """
     trials = bench.trials(bench.draws("trade", range(bench.config.trade.trials)))
     chain = bench.chains["recommended"]
     found = [name for name, stage in chain.stages.items() if "velocity_m_s" in getattr(stage, "provides", ())]
@@ -182,7 +186,9 @@ def _estimates(bench: Bench) -> Measured:
 
 
 def _summed(bench: Bench, name: str) -> DirectlySummed:
-    """Image of white noise by a filter of the recommended method, on the axes of its data."""
+    """Image of white noise by an azimuth filter of the recommended method, on the axes of
+    its data.
+    """
     draws, chain = bench.draws(), bench.chains["recommended"]
     data = chain.trace(bench.trials(bench.draws("trade", [0])).recording).inputs[name]
     beam = getattr(chain.stages[name], "beam_rad", None) or bench.radar.beam_rad

@@ -15,7 +15,7 @@ from torchsar.study.systems.sal.judge import Course, finer_in_range
 from torchsar.study.trials.batch import Result, image_of
 from torchsar.study.trials.cuts import impulse_cuts
 
-# dynamic range of images and profiles, so that images out of focus are visible beside sharp ones
+# dynamic range of images and profiles, in which images out of focus are visible beside sharp ones
 _RANGE_DB = 40.0
 Lines = Mapping[str, tuple[Axis, Tensor]]
 
@@ -36,8 +36,10 @@ def target(result: Result) -> Drawn:
 
 
 def _about_scene(signal: Signal, result: Result) -> Signal:
-    """The part of an image or of profiles about the scatterers. It includes shifts by residual
-    motion: in range by its velocity, in azimuth by its slope, if the image is in focus.
+    """Part of an image or of profiles around the scatterers.
+
+    It allows for shifts by residual motion: in range by its velocity, and in azimuth by its slope,
+    if the image is in focus.
     """
     azimuth, range_m = result.first.trials.first("azimuth_m", "range_m")
     radar = result.bench.radar
@@ -48,7 +50,8 @@ def _about_scene(signal: Signal, result: Result) -> Signal:
     velocity = result.first.trials.truth["velocity_m_s"]
     shift = velocity[:1].cpu() * radar.carrier_hz / radar.chirp_rate_hz_s
     shifted = torch.cat([range_m + shift.min().clamp(max=0.0), range_m + shift.max().clamp(min=0.0)])
-    # margins of 24 samples in azimuth, 6 cells in range, and a tenth of the extent of the scene
+    # margins of 24 samples in azimuth, of 6 cells in range, and of a tenth of the extent of the
+    # scene
     return plot.within(
         signal,
         {
@@ -102,7 +105,9 @@ def _images(result: Result) -> Drawn:
 
 
 def _motion(result: Result) -> Drawn:
-    """Velocity, its error, and the remaining range error; errors of similar size share a panel."""
+    """Draw velocity, its error, and the remaining range error. Errors of similar size have a common
+    panel.
+    """
     courses = {name: course for name, course in _courses(result).items() if name != "ideal"}
     estimating = {name: course for name, course in courses.items() if course.velocity_m_s is not None}
     if not estimating:
@@ -149,7 +154,9 @@ def _by_size(title: str, unit: str, lines: Lines) -> list[dict[str, object]]:
 
 
 def _slices(result: Result) -> Drawn:
-    """Cuts through the response of metrics.target, four methods in a panel beside the ideal one."""
+    """Draw cuts through the response of metrics.target. A panel contains four methods and the ideal
+    one.
+    """
     target, images = result.bench.judging.target, result.images
     figures = {n: o.judged.targets[target] for n, o in result.first.outcomes.items() if target in o.judged.targets}
     at = {n: [float(f[f"position_{axis}_m"][0]) for axis in ("azimuth", "range")] for n, f in figures.items()}
@@ -175,7 +182,7 @@ def _slices(result: Result) -> Drawn:
 
 
 def _within(reach: float, offset_m: Tensor, response: Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """The part of a cut that other cuts of the panel have, in dB."""
+    """Part of a cut within `reach`, which all cuts of the panel cover, in dB."""
     near = offset_m.abs() <= reach
     return plot.array(offset_m[near]), plot.decibel(response[near])
 

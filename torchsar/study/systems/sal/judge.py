@@ -109,8 +109,8 @@ class Course:
         return self.lit.sum(-1).clamp_min(1)
 
     def _line(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Least-squares line through the lit pulses: mean, slope per pulse, and the pulses counted
-        from the middle of the lit ones.
+        """Least-squares line through the lit pulses: mean, slope per pulse, and pulse numbers
+        relative to the middle of the lit ones.
         """
         k = torch.arange(x.shape[-1], dtype=torch.float64, device=x.device).expand(self.lit.shape)
         k = k - (torch.where(self.lit, k, 0).sum(-1) / self._count)[..., None]
@@ -167,7 +167,8 @@ def course_of(chain: Chain, trace: Trace, truth: Mapping[str, Tensor], radar: Tr
         per_m = 4 * math.pi / radar.wavelength_m
         error = _unwrapped(coarse * per_m + phase) / per_m
     shines = leading(truth["amplitude"].abs())
-    azimuth = torch.where(shines, truth["azimuth_m"], math.inf)  # others are never in the beam
+    # other scatterers are never in the beam
+    azimuth = torch.where(shines, truth["azimuth_m"], math.inf)
     lit = lit_periods(radar, pulse, azimuth, truth["range_m"].expand(azimuth.shape)).expand(error.shape)
     return Course(pulse, velocity, None if velocity is None else velocity - true, error, coarse, lit)
 
@@ -231,21 +232,23 @@ def finer_in_range(image: Signal) -> Signal:
     azimuth, range_ = image.axes
     n, data = range_.n, image.data.to(torch.complex128)
     cell = torch.arange(2 * n, dtype=torch.float64, device=data.device)
-    half = (n - 1) / (2 * n)  # the middle of the sweep, in turns a cell
+    half = (n - 1) / (2 * n)  # middle of the sweep, in cycles per range cell
     sweeps = torch.fft.ifft(data * unit_phasor(-half * cell[:n], torch.complex128))
     fine = torch.fft.fft(sweeps, 2 * n) * unit_phasor(half / 2 * cell, torch.complex128)
     return Signal(fine, (azimuth, Axis("range", 2 * n, range_.start, range_.step / 2, range_.unit)))
 
 
 def _unwrapped(phase: Tensor) -> Tensor:
-    """Phases (..., n) with steps within half a turn, beginning where they begin."""
+    """Unwrap phases (..., n), so that steps are within half a cycle; the first value is
+    unchanged.
+    """
     step = torch.diff(phase)
     step = step - 2 * math.pi * torch.round(step / (2 * math.pi))
     return torch.cat([phase[..., :1], phase[..., :1] + step.cumsum(-1)], -1)
 
 
 def _sweeps_axis(trace: Trace) -> Axis:
-    """Starts of the periods of the last separated sweeps."""
+    """Axis of the starts of the periods of the last separated sweeps."""
     found = [signal for signal in (*trace.inputs.values(), *trace.outputs.values()) if signal.names == SWEEPS]
     if not found:
         raise ValueError(
@@ -256,14 +259,17 @@ def _sweeps_axis(trace: Trace) -> Axis:
 
 
 def _compensated(chain: Chain, trace: Trace) -> Tensor | None:
-    """Velocity that was removed, or for a chain without an image would be, (..., pulse)."""
+    """Velocity (..., pulse) that was removed, or that would be removed in a chain without
+    an image.
+    """
     used = {key for uses in chain.uses.values() for key in uses}
     return _summed(chain, trace, "velocity_m_s") if "velocity_m_s" in used or trace.signal.names == SWEEPS else None
 
 
 def _summed(chain: Chain, trace: Trace, name: str, used_only: bool = False) -> Tensor | None:
-    """Sum over the stages that use a value of what they are given; without any, the last estimate
-    of it; None where there is none.
+    """Sum of a value over the stages that use it.
+
+    If no stage uses it, the sum is the last estimate of the value; None if there is none.
     """
     taken = used_values(chain, trace, name)
     if not taken and not used_only:

@@ -150,7 +150,7 @@ def estimation_metrics(trace: Trace, trials: Trials, prf_hz: float) -> dict[str,
 
 
 def error_name(name: str) -> str:
-    """'doppler_hz' -> 'doppler_error_hz'."""
+    """Name of the error of a value: 'doppler_hz' gives 'doppler_error_hz'."""
     return _UNIT.sub(r"_error_\1", name) if _UNIT.search(name) else f"{name}_error"
 
 
@@ -217,7 +217,7 @@ def over_targets(bench: Bench, judged: Judged, ideal: Judged | None) -> Judged:
 
 
 class Stripmap(System):
-    """Side-looking radar on a straight path."""
+    """shape (target, trial)"""
 
     name = "stripmap"
     about = "side-looking radar on a straight path, simulated or recorded raw data"
@@ -228,7 +228,7 @@ class Stripmap(System):
     reads = "raw stripmap"
     ending = "a focusing stage"
     truths = ("doppler_hz", "velocity_m_s")
-    # the address of draws without a batch, so that the results of earlier versions are reproduced
+    # the address has no batch, so that the results of earlier versions are reproduced
     address = 0
     peak = 2.0
     tolerance = {"image_error_db": -20.0, "echo_error_db": -20.0, "data_error_db": -20.0}
@@ -300,7 +300,8 @@ class Stripmap(System):
         if trace.signal.names != IMAGE:
             return Judged(metrics)
         used = Used.by(chain, trace, bench.radar, n)
-        if not trace.signal.data.is_complex():  # the metrics of images and responses are those before detection
+        # the metrics of images and responses are those before detection
+        if not trace.signal.data.is_complex():
             return Judged({**metrics, **used.metrics(bench.radar)}, view=used)
         image = trace.signal.isel(**window(trace.signal, bench.radar, bench.judging.margin))
         metrics.update(
@@ -322,7 +323,8 @@ class Stripmap(System):
         if not (one.data.is_complex() and other.data.is_complex()):
             return judged
         pair = [
-            image.isel(**window(image, bench.radar, bench.judging.margin)).to(torch.complex128)  # sums over many pixels
+            # double precision for sums over many pixels
+            image.isel(**window(image, bench.radar, bench.judging.margin)).to(torch.complex128)
             for image in common_lines(one, other)
         ]
         count = len(judged.metrics["seconds"])

@@ -32,7 +32,8 @@ from torchsar.study.trials.choice import (
     points_of_a_strip,
 )
 
-# a period of four timing offsets (samples) as in Tsvetkov 2017, and raw lines enough to time them
+# timing offsets in samples of a period of four, as in Tsvetkov 2017, and enough raw lines to
+# measure the time
 _OFFSETS, _LINES = (0.0, 0.18, -0.12, 0.07), 1024
 FORMS = {
     "range_doppler": "range-Doppler",
@@ -101,9 +102,9 @@ class StripProbe:
         return recording.signal, PointPatches.about(self.radar, self.size, *at, *known), known
 
     def rows(self) -> tuple[Requirement, ...]:
-        """Return what each simplified focusing neglects for this size, Doppler and velocity."""
+        """Return the errors of each simplified focusing for this size, Doppler and velocity."""
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # an aliased aperture is one of the limits
+            warnings.simplefilter("ignore")  # an aliased aperture is reported among the limits
             return requirements(self.radar, self.radar.raw_axes(*self.size), *self.motion)
 
 
@@ -161,12 +162,14 @@ def choices(bench: Bench, rows: Mapping[str, Requirement]) -> list[Choice]:
 
 
 def _focused(bench: Bench, form: str, signal: Signal, known: tuple[Tensor, Tensor]) -> Tensor:
-    """The image by a form, with given Doppler and velocity."""
+    """Focus a signal by a form, with given Doppler and velocity."""
     return GROUPS["focus"][form](bench.radar, "matched", velocity_m_s=known[1], doppler_hz=known[0])(signal).data
 
 
 def _forms(bench: Bench) -> Measured:
-    """Whole images by each form against backprojection of patches about the points."""
+    """Measure whole images by each form, relative to backprojection of patches around the
+    points.
+    """
     probe = probe_of(bench)
     raw, patches, known = probe.seen()
     signal, exact = raw.to(bench.dtype), patches.exact(raw, *known)
@@ -182,13 +185,13 @@ def _forms(bench: Bench) -> Measured:
 
 
 def _form_of(bench: Bench) -> str:
-    """The form of focusing of the recommended method."""
+    """Form of focusing of the recommended method."""
     names = [entry["stage"] for entry in (bench.config.processor["recommended"].stages or {}).values()]
     return next((name for name in names if name in FORMS), "omega_k")
 
 
 def _summed(bench: Bench) -> DirectlySummed:
-    """Points at random positions of the swath, by the recommended form."""
+    """Image of points at random positions of the swath, by the recommended form."""
     probe, radar = probe_of(bench), bench.radar
     reach = max(0.0, probe.size[0] / radar.prf_hz - probe.dwell_s) / 2 * radar.velocity_m_s
     at = bench.draws().uniform("trade.points", (2, PIXELS))
@@ -201,7 +204,7 @@ def _summed(bench: Bench) -> DirectlySummed:
 
 
 def _precisions(bench: Bench) -> Measured:
-    """The recommended form in single precision against double precision."""
+    """Measure the recommended form in single precision, relative to double precision."""
     probe = probe_of(bench)
     raw, patches, known = probe.seen()
     form = _form_of(bench)
@@ -215,7 +218,7 @@ def _precisions(bench: Bench) -> Measured:
 
 
 def _histories(bench: Bench) -> Measured:
-    """Echoes by each range history, point by point."""
+    """Measure echoes of single points by each range history."""
     probe, paths = probe_of(bench), {"parabola": Parabola(), "hyperbola": Hyperbola()}
     alone = [replace(probe, world=replace(probe.world, scene=Points([0.0], [r]))) for r in probe.edges_m]
 
@@ -242,7 +245,7 @@ _CORRECTORS: dict[str, Any] = {
 
 
 def _jitter(bench: Bench) -> Measured:
-    """Correctors of a known periodic jitter on the first lines of raw data."""
+    """Measure correctors of a known periodic jitter on the first lines of raw data."""
     raw = probe_of(bench).recorded(bench.dtype)[0].signal.data
     lit = raw.abs().square().sum(-1).argmax()
     raw = raw[max(0, int(lit) - _LINES // 2) :][:_LINES]

@@ -54,7 +54,7 @@ def range_spectrum(signal: Signal) -> Tensor:
         Power with zero frequency in the middle, (range,), float64.
     """
     power = torch.zeros(signal.axes[-1].n, dtype=torch.float64)
-    for block in signal.data.split(256):  # a few megabytes of complex samples
+    for block in signal.data.split(256):  # a few megabytes of complex samples at a time
         power += torch.fft.fft(block).abs().square().sum(0).double().cpu()
     return torch.fft.fftshift(power)
 
@@ -77,8 +77,8 @@ def phase_increments(signal: Signal, blocks: int = 64) -> tuple[Tensor, Tensor]:
     return centres, torch.stack([torch.angle(part.sum()) for part in product.tensor_split(blocks)])
 
 
-# the part of the velocity curve that is drawn finely: half its extent in steps of the grid, and its
-# number of points, of which the middle one is the estimate
+# Part of the velocity curve that is drawn finely: half its extent in steps of the grid, and its
+# number of points, of which the middle one is the estimate.
 _NEAR_STEPS, _NEAR_POINTS = 1.5, 41
 # methods whose cuts differ enough to be distinguished in one picture
 _CUT_METHODS = ("clean", "none", "baseline", "recommended")
@@ -102,14 +102,14 @@ class Strip:
     def scale(self) -> dict[str, Any]:
         """Level of 0 dB (as a percentile) and dynamic range of drawn images.
 
-        0 dB is the peak if the scene has point targets, and else the level that 0.1 % of the
+        0 dB is the peak if the scene has point targets, and otherwise the level that 0.1 % of the
         samples exceed.
         """
         known = bool(self.result.targets)
         return {"percentile": 100.0 if known else 99.9, "dynamic_range_db": 60.0 if known else 50.0}
 
     def images(self) -> dict[str, Signal]:
-        """Images of all methods but reruns, in the window that the metrics use."""
+        """Images of all methods except reruns, in the window that the metrics use."""
         methods, margin = self.result.bench.config.processor, self.result.bench.judging.margin
         images = {name: image for name, image in self.result.images.items() if methods[name].rerun is None}
         return {name: image.isel(**window(image, self.radar, margin)) for name, image in images.items()}
@@ -326,7 +326,7 @@ def _image_corrections(result: Result) -> Drawn:
 
 
 def _velocity(result: Result) -> Drawn:
-    """Draw the entropy that the velocity search minimises, finely about the estimate."""
+    """Draw the entropy that the velocity search minimises, with fine steps near the estimate."""
     strip = Strip(result)
     bench, first = strip.result.bench, strip.result.first_of("recommended")
     chain = bench.chains["recommended"]

@@ -1,4 +1,6 @@
-"""Which part of the image of a strip counts, and with which parameters it was focused."""
+"""Part of the image of a strip that metrics use, and parameters with which the image was
+focused.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,8 @@ from torchsar.radar import StripmapRadar
 from torchsar.study.trials.batch import last_stage
 
 log = logging.getLogger("torchsar")
-# metrics of a window of fewer lines or samples would depend on a few targets
+# least number of lines or samples of a window; metrics of a smaller one would depend on a few
+# targets
 _LEAST = 32
 
 
