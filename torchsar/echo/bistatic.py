@@ -111,7 +111,7 @@ class _Lines:
         receive: ReceiveRange,
         transmit: TransmitRange | None,
     ) -> _Lines:
-        """Ranges and weights of targets at some pulses."""
+        """Compute ranges and weights of targets at some pulses."""
         range_m = receive.range_m(movers, time_s, radar)
         if movers.bend is not None:
             range_m = range_m + movers.bend.transmit_m(time_s)
@@ -122,11 +122,11 @@ class _Lines:
         return _Lines(range_m + late_m, (range_m + true) / radar.wavelength_m, weight)
 
     def peaks(self, dtype: torch.dtype) -> Tensor:
-        """Sum over targets as if each lay on the one recorded line, (..., channel, pulse)."""
+        """Sum over targets as if all were in the one recorded range line, (..., channel, pulse)."""
         return (unit_phasor(-self.turns, dtype) * self.weight.to(dtype)).sum(-1)
 
     def spectrum(self, grid: _Grid, radar: BistaticRadar, dtype: torch.dtype) -> Tensor:
-        """Sum over targets in range frequency, rising order, (..., channel, pulse, n_fft)."""
+        """Sum over targets in range frequency, in rising order, (..., channel, pulse, n_fft)."""
         samples = self.envelope_m / radar.range_step_m + grid.n_range // 2
         inside = (samples > -grid.margin) & (samples < grid.n_range + grid.margin)
         weight = self.weight * inside
@@ -137,7 +137,9 @@ class _Lines:
 
 @dataclass(frozen=True)
 class _Grid:
-    """FFT length for recorded lines; margin: samples beyond a line whose echoes reach into it."""
+    """FFT length of recorded lines. margin: number of samples beyond a line whose echoes reach into
+    the line.
+    """
 
     n_range: int
     n_fft: int
@@ -146,7 +148,7 @@ class _Grid:
 
     @staticmethod
     def of(radar: BistaticRadar, n_range: int, kind: Kind) -> _Grid:
-        """The shortest fast FFT in which echoes do not wrap."""
+        """Choose the shortest fast FFT in which echoes do not wrap."""
         margin = max(32, n_range // 8) if kind == "compressed" else radar.pulse.n_samples(radar.sampling_hz)
         return _Grid(n_range, smooth_length(n_range + 2 * margin), margin, kind)
 
@@ -230,7 +232,7 @@ def simulate_bistatic(
         dtype=dtype,
     )
     if world.sea is not None:
-        gate: Any = world.gate  # sea_echo rejects other gates
+        gate: Any = world.gate  # `sea_echo` rejects other gates
         sea = sea_echo(world.sea, radar, n_pulse, n_range, gate, draws.part("sea"), dtype, device)
         lines = _received(sea[..., None] if n_range is None else sea, transmit_m, radar, kind)
         echo = echo + (lines[..., 0] if n_range is None else lines)
@@ -245,7 +247,7 @@ def simulate_bistatic(
 def _movers(
     radar: BistaticRadar, world: BistaticWorld, n_range: int | None, draws: Draws, device: torch.device | str | None
 ) -> Movers:
-    """Targets on the device, checked against receiver and range axis."""
+    """Targets on the device, after a check against the receiver and the range axis."""
     if world.scene is None:
         none = torch.zeros(0, dtype=torch.float64, device=device)
         return Movers(none, none, none, none, none.to(torch.complex128))
@@ -277,7 +279,7 @@ def _movers(
 
 
 def _warn_of_unlit(movers: Movers, radar: BistaticRadar, gate: Gate, n_pulse: int) -> None:
-    """Warn of targets that a band-limited gate passes at no pulse of the record."""
+    """Warn of targets that a band-limited gate does not pass at any pulse of the record."""
     if not isinstance(gate, BandLimited):
         return
     closest_s = (movers.y0_m / (radar.speed_m_s - movers.u_a_m_s)).detach().abs()
@@ -320,7 +322,9 @@ def _refuse_impossible(
 
 
 def _received(sea: Tensor, transmit_m: Tensor, radar: BistaticRadar, kind: Kind) -> Tensor:
-    """Sea with the range to the transmitter on its carrier; full echoes are spread by the pulse."""
+    """Echo of the sea with the carrier phase of the range to the transmitter. Full echoes are
+    spread by the pulse.
+    """
     if kind == "full":
         n_range = sea.shape[-1]
         n_fft = _Grid.of(radar, n_range, kind).n_fft

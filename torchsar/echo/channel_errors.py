@@ -75,7 +75,9 @@ class ChannelErrors:
     delay_s: Sequence[Tensor | float] | Tensor | None = None
 
     def _values(self, name: str, channels: int, device: torch.device) -> Tensor:
-        """Values of a parameter for all channels, zero where it is not given, (..., channel)."""
+        """Values of a parameter for all channels, (..., channel). They are zero if the parameter is
+        not given.
+        """
         given = getattr(self, name)
         value = torch.zeros(channels, dtype=torch.float64) if given is None else stacked(given)
         if not value.ndim or value.shape[-1] != channels:
@@ -179,7 +181,7 @@ class SynchronisationError:
             )
         )
         tail = (None,) * (-signal.dim("pulse") - 1)
-        # azimuth-only data have no range cells and admit no delay
+        # azimuth-only data have no range cells, so that there can be no delay
         if self.delay_s or isinstance(self.delay_sinusoid_s, Tensor) or self.delay_sinusoid_s:
             _refuse_delay(recording, "a synchronisation error")
             signal = delayed(signal, delay[..., None, :], radar)
@@ -211,7 +213,7 @@ class SynchronisationError:
         return total + amplitude * torch.sin(2 * math.pi * frequency * time_s + start)
 
     def _direct_path(self, turn: Tensor, delay_s: Tensor, radar: BistaticRadar, draws: Draws) -> Tensor:
-        """Direct signal of each pulse, (..., pulse, direct_samples)."""
+        """Simulate the direct signal of each pulse, (..., pulse, direct_samples)."""
         n = self.direct_samples
         worst = float(delay_s.abs().max()) * radar.sampling_hz
         if not worst <= n / 4:

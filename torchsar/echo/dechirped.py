@@ -129,9 +129,11 @@ def _turn(rotation: Rotation, radar: InverseRadar, n_pulse: int, like: Tensor) -
 def _pulse_range(
     motion: Sequence[Motion], track: Sequence[Motion], pulse_s: Tensor, fast_s: Tensor, half_s: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Range of the whole target at the middle of each pulse relative to the reference of the
-    receiver, slope of its chord (m/s), (*trials, pulse), and its deviation from this straight line
-    in metres, (*trials, pulse, fast_time). The reference is fixed within a pulse.
+    """Motion of the whole target in each pulse.
+
+    Returns its range at the middle of the pulse relative to the reference of the receiver, and the
+    slope of its chord (m/s), (*trials, pulse) each. Also returns its deviation from this straight
+    line in metres, (*trials, pulse, fast_time). The reference is fixed within a pulse.
     """
     start, middle, end = (displacement_m(motion, pulse_s + shift) for shift in (-half_s, 0.0, half_s))
     speed = (end - start) / (2 * half_s)
@@ -147,18 +149,20 @@ def _scatterer_lines(
     turn: Sequence[Tensor],
     path: tuple[Tensor, Tensor, Tensor],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Phase of every scatterer in every pulse, without the part common to all: its start (cycles),
-    slope (Hz), curve (cycles/s^2), and cycles per metre of the deviation of the motion of the whole
-    target from a straight line, (*trials, pulse, target) each.
+    """Phase of every scatterer in every pulse, without the part common to all scatterers.
+
+    Returns its start (cycles), its slope (Hz), and its curvature (cycles/s^2), (*trials, pulse,
+    target) each. The fourth result has the unit cycles per metre: it multiplies the deviation of
+    the motion of the whole target from a straight line.
 
     At the time t' from the middle of a pulse, the rotation moves a scatterer to the range
 
         r + (x cos theta - y' sin theta) (rate t' + acceleration t'^2 / 2)
           - (x sin theta + y' cos theta) (rate t')^2 / 2.
 
-    r is its range at the middle of the pulse, x its cross range and y' its range from the
-    centre of rotation. theta, rate and acceleration are the rotation angle and its derivatives
-    at the middle of the pulse.
+    Here r is its range at the middle of the pulse, x its cross range, and y' its range from the
+    centre of rotation. theta, rate and acceleration are the rotation angle and its derivatives at
+    the middle of the pulse.
     """
     x, y, lever = x[..., None, :], y[..., None, :], lever[..., None, :]
     theta, rate, acceleration = turn
@@ -182,7 +186,7 @@ def _scatterer_lines(
 
 
 def _common_turns(radar: InverseRadar, path: tuple[Tensor, Tensor, Tensor], fast_s: Tensor) -> Tensor:
-    """Cycles by the motion of the whole target, (*trials, pulse, fast_time)."""
+    """Cycles due to the motion of the whole target, (*trials, pulse, fast_time)."""
     middle_m, speed_m_s, bend_m = path
     delay = 2 / radar.wave_speed_m_s * (middle_m[..., None] + speed_m_s[..., None] * fast_s + bend_m)
     return -delay * (radar.carrier_hz + radar.chirp_rate_hz_s * (fast_s - delay / 2))
@@ -202,7 +206,7 @@ def _sum_of_lines(
     for order in range(1, _series_terms(curve) + 1):
         term = curve.pow(order) / math.factorial(order)
         total = total + line_sum(tables, weight * (term * 1j**order).to(dtype), n) * u2.pow(order).to(dtype)
-    # the deviation of the motion changes phases between scatterers as well
+    # the deviation of the motion also changes the phase between scatterers
     off_m = float(bend_m.detach().abs().max())
     worst = 2 * math.pi * float(bend.detach().abs().max()) * off_m
     if not worst**2 / 2 <= _DROPPED_RAD:
@@ -216,9 +220,9 @@ def _sum_of_lines(
 
 
 def _series_terms(phase_rad: Tensor) -> int:
-    """Number of terms beyond the first of the power series of exp(j phase), for an error of 1e-12.
+    """Number of terms, beyond the first, of the power series of exp(j phase) for an error of 1e-12.
 
-    There is at least one, so that gradients are right for a target at rest, too.
+    There is at least one, so that gradients are also correct for a target at rest.
     """
     worst = float(phase_rad.detach().abs().max())
     for order in range(1, 13):
@@ -233,9 +237,9 @@ def _series_terms(phase_rad: Tensor) -> int:
 def _refuse_fast_turns(
     radar: InverseRadar, radius_m: float, turn: Sequence[Tensor], rotation: Rotation, half_s: float
 ) -> None:
-    """Raise ValueError if the orders of rotation that are dropped matter."""
+    """Raise ValueError if the neglected orders of the rotation are not negligible."""
     angle, rate, acceleration = (v.detach() for v in turn)
-    # largest angles by which the target turns in half a pulse, by their order in time
+    # largest angles by which the target rotates in half a pulse, by their order in time
     by_rate, by_acceleration = float(rate.abs().max()) * half_s, float(acceleration.abs().max()) * half_s**2 / 2
     beyond = 0.0
     if isinstance(rotation, PolynomialRotation):

@@ -138,7 +138,7 @@ class WideInterferer:
         data, fs = recording.signal.data, recording.radar.sampling_hz
         lines = _chosen_lines(draws, self.share, data)
         n_pulse, n = data.shape[-2:]
-        # at least 8 random coefficients, however narrow the band
+        # there are at least 8 random coefficients, however narrow the band is
         n_long = max(2 * n, math.ceil(8 * fs / self.bandwidth_hz))
         half = int(self.bandwidth_hz / 2 / fs * n_long)
         coefficients = draws.normal("wide.coefficients", (n_pulse, 2 * half + 1), data.dtype, data.device)
@@ -194,8 +194,8 @@ class Quantiser:
         parts = torch.view_as_real(recording.signal.data)
         rms = parts.square().mean((-3, -2, -1)).sqrt()
         levels = with_dims(self.rms_levels, 0, rms)
-        # torch divides a number by a tensor in this way; another rounding would move samples at the
-        # edge of a level
+        # torch divides a number by a tensor in this way; rounding in another way would move samples
+        # at the edge of a level
         gain = (levels.to(rms.dtype) if isinstance(levels, Tensor) else levels) * torch.where(
             rms > 0, rms, 1
         ).reciprocal()
@@ -212,7 +212,9 @@ def _check_share(share: Tensor | float) -> None:
 
 
 def _chosen_lines(draws: Draws, share: Tensor | float, data: Tensor) -> Tensor:
-    """Mask of round(share * lines) lines chosen at random, at least one, bool (..., pulse)."""
+    """Mask of round(share * lines) lines that are chosen at random, at least one, bool (...,
+    pulse).
+    """
     n_pulse = data.shape[-2]
     count = torch.round(per_trial(share, 1, data) * n_pulse).clamp_min(1)
     order = draws.permutation("interference.lines", n_pulse, data.device)
@@ -221,7 +223,9 @@ def _chosen_lines(draws: Draws, share: Tensor | float, data: Tensor) -> Tensor:
 
 
 def _add(recording: Recording, wave: Tensor, lines: Tensor, over_signal_db: Tensor | float) -> Recording:
-    """The recording plus a wave of unit mean power, at a level over the mean power of its lines."""
+    """Add a wave of unit mean power to the lines of a recording, at a level relative to the mean
+    power of these lines.
+    """
     data = recording.signal.data
     power = (data.abs().square().mean(-1) * lines).sum(-1) / lines.sum(-1)
     ratio = 10 ** (per_trial(over_signal_db, 0, data) / 10)

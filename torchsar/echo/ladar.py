@@ -19,7 +19,7 @@ from torchsar.scene.ladar import SweepError
 from torchsar.scene.ladar_range import Fidelity, RangeHistory
 
 _DEFAULT = LinearInSweep()
-# sign of the sweep rate in up-sweeps and down-sweeps
+# sign of the sweep rate in up-sweeps and in down-sweeps
 _RATES = (1.0, -1.0)
 
 
@@ -239,7 +239,9 @@ def _sum_of_lines(
 
 
 def _sum_with_errors(weight: Tensor, turns: Tensor, table: Tensor) -> Tensor:
-    """The same with a phase table (..., 2, 1, target, n), scatterer by scatterer."""
+    """Sum over scatterers, one after the other, multiplied by a phase table (..., 2, 1,
+    target, n).
+    """
     n, total = table.shape[-1], torch.zeros((), dtype=table.dtype, device=table.device)
     for at in range(turns.shape[-1]):
         phasor = weight[..., at, None] * linear_phasor(turns[..., at], -(n - 1) / 2, n, table.dtype)
@@ -248,7 +250,7 @@ def _sum_with_errors(weight: Tensor, turns: Tensor, table: Tensor) -> Tensor:
 
 
 def _error_table(error: SweepError, s: Scatterers, u: Tensor, radar: TriangularLadar, dtype: torch.dtype) -> Tensor:
-    """exp(2j pi (e(u) - e(u - dtau))) of scatterers at rest, (..., 2, 1, target, n)."""
+    """Phasors exp(2j pi (e(u) - e(u - dtau))) of scatterers at rest, (..., 2, 1, target, n)."""
     delay = (2 / radar.wave_speed_m_s * s.range_m)[..., None]
     turns = [error.turns(u, ramp, 2) - error.turns(u - delay, ramp, 2) for ramp in (0, 1)]
     return unit_phasor(torch.stack(torch.broadcast_tensors(*turns), -3), dtype)[..., None, :, :]
@@ -257,7 +259,7 @@ def _error_table(error: SweepError, s: Scatterers, u: Tensor, radar: TriangularL
 def _sampled(
     history: RangeHistory, error: SweepError | None, middle_s: Tensor, lit: Tensor, trials: int, dtype: torch.dtype
 ) -> Tensor:
-    """Sum over scatterers with the range at every sample, in blocks of pulses."""
+    """Sum over scatterers, with the range computed at every sample, in blocks of pulses."""
     s, radar = history.scatterers, history.radar
     u = radar.fast_time_axis().values(middle_s.device)
     amplitude = s.amplitude[..., None, None, :].to(dtype) * lit
@@ -365,7 +367,7 @@ def simulate_ladar(
     data = echo_of(course.motion) * level if course.motion else clean
     if world.snr_db is not None:
         added = noise(draws, "echo.ladar.noise", (2, n_period, axes[2].n), values["noise_std"], dtype, data.device)
-        # both signs give conjugate data
+        # the two dechirp signs give conjugate data
         added = added.conj().resolve_conj() if radar.dechirp_sign == "echo_conj_lo" else added
         clean, data = clean + added, data + added
     aux = calibration_aux(radar, world, n_period, draws, dtype, device)

@@ -19,8 +19,8 @@ from torchsar.scene.fluctuation import Tones, drawn_motion
 from torchsar.scene.trials import refuse_other_trials
 from torchsar.scene.vibration import displacement_m
 
-# nodes of the interpolation between trigger times: through 16 Chebyshev nodes a sinusoid with one
-# cycle over their span is exact to 1e-14 of its amplitude
+# Number of interpolation nodes between trigger times. Through 16 Chebyshev nodes, a sinusoid with
+# one cycle over their span is exact to 1e-14 of its amplitude.
 _NODES = 16
 
 
@@ -131,12 +131,12 @@ class LadarCourse:
                 (...,); None for zero.
 
         Returns:
-            Tensors by name: the radial velocity of the target `velocity_m_s` and its deviation from
-            the nominal range `range_error_m` at the turning points between up-sweep and down-sweep,
-            the same deviation at the middles of the sweeps (`range_error_up_m`,
-            `range_error_down_m`), `azimuth_m`, `range_m` and `amplitude` of the scatterers,
-            `noise_std`, and, if turbulence changes the amplitude of the echo, the logarithm
-            `log_amplitude` of this change at the turning points.
+            Tensors by name. The radial velocity of the target `velocity_m_s` and its deviation from
+            the nominal range `range_error_m` refer to the turning points between up-sweep and
+            down-sweep. The same deviation at the middles of the sweeps is `range_error_up_m` and
+            `range_error_down_m`. There are also `azimuth_m`, `range_m` and `amplitude` of the
+            scatterers, and `noise_std`. If turbulence changes the amplitude of the echo,
+            `log_amplitude` is the logarithm of this change at the turning points.
         """
         then = (
             middle_s
@@ -164,7 +164,7 @@ def _later(value: Callable[[Tensor], Tensor], time_s: Tensor, later_s: Tensor | 
     """
     if later_s is None or later_s.ndim == 0:
         return value(time_s if later_s is None else time_s + later_s)
-    # where trials differ: a polynomial through nodes that they share
+    # if trials have different times, a polynomial through common nodes is evaluated
     nodes = _nodes(later_s)
     known = value(time_s + nodes[:, None])
     gaps = nodes[:, None] - nodes + torch.eye(len(nodes), dtype=torch.float64, device=time_s.device)
@@ -175,7 +175,7 @@ def _later(value: Callable[[Tensor], Tensor], time_s: Tensor, later_s: Tensor | 
 
 
 def _nodes(values: Tensor) -> Tensor:
-    """The different values themselves, or Chebyshev nodes over their span where there are many."""
+    """The distinct values themselves, or Chebyshev nodes over their span if there are many."""
     nodes = values.detach().unique()
     if len(nodes) <= _NODES and not values.requires_grad:
         return nodes
@@ -203,7 +203,7 @@ def noise_std(snr_db: Tensor | float | None, like: Tensor) -> Tensor:
 
 
 def _gated(s: Scatterers, gate_m: tuple[Tensor | float, Tensor | float] | None) -> Scatterers:
-    """Scatterers with zero amplitude outside the gate."""
+    """Set the amplitude of scatterers outside the gate to zero."""
     if gate_m is None:
         return s
     low, high = (per_trial(bound, 1, s.range_m) for bound in gate_m)

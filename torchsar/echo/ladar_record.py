@@ -101,17 +101,21 @@ def ladar_record(
 
 @dataclass(frozen=True)
 class _Ramps:
-    """Times within triangle and sweep (s) and sweep rate (Hz/s) at the samples of a block."""
+    """Times within the triangle and within the sweep (s), and sweep rate (Hz/s), at the samples of
+    a block.
+    """
 
     radar: TriangularLadar
-    position_s: Tensor  # since the start of the triangle
-    middle_s: Tensor  # since the middle of the sweep
-    rate: Tensor  # signed
+    position_s: Tensor  # time since the start of the triangle
+    middle_s: Tensor  # time since the middle of the sweep
+    rate: Tensor  # sweep rate with its sign
     video: float  # 0.5, or 0 without the residual video phase
 
     @staticmethod
     def of(radar: TriangularLadar, time_s: Tensor, trigger_s: Tensor | float, video: float) -> _Ramps:
-        """The triangle at the samples of a block, (n,), or (*trials, 1, n) by trigger times."""
+        """The triangle at the samples of a block, (n,), or (*trials, 1, n) if the trigger times
+        differ.
+        """
         trigger = torch.as_tensor(trigger_s, dtype=torch.float64, device=time_s.device)
         position = time_s - (trigger if trigger.ndim == 0 else per_trial(trigger, 2, time_s))
         position = position - radar.period_s * torch.floor(position.detach() / radar.period_s + 1e-9)
@@ -120,7 +124,7 @@ class _Ramps:
         return _Ramps(radar, position, middle, radar.chirp_rate_hz_s * torch.where(down, -1.0, 1.0).to(time_s), video)
 
     def turns(self, delay: Tensor, error: SweepError | None) -> Tensor:
-        """Phase of a beat of given delays in cycles, (..., pulse, n)."""
+        """Phase in cycles, (..., pulse, n), of a beat signal with given delays."""
         late = torch.relu((self.middle_s - delay).abs() - self.radar.sweep_s / 2)
         turns = delay * (self.radar.carrier_hz + self.rate * (self.middle_s - self.video * delay))
         turns = turns + self.rate * late.square()
@@ -187,8 +191,8 @@ class BlockPaths:
         effects: tuple[Effect, ...] = ("flight", "hyperbola") if "hyperbola" in without else ("flight",)
         still = RangeHistory(scatterers, radar, (), float(start_s[0]), effects)
         first, middle, last = (still.at(then + share * length) for share in (0.0, 0.5, 1.0))
-        # with 64 knots of the spline in a period the error is 1e-7 of a vibration with the period
-        # of the triangle, and 1e-4 of one six times as fast
+        # With 64 knots of the spline per period, the error is 1e-7 of a vibration with the period
+        # of the triangle, and 1e-4 of one six times as fast.
         count = max(4, math.ceil(length / radar.period_s * 64))
         steps = length / count * torch.arange(count + 1, dtype=torch.float64, device=start_s.device)
         knots = displacement_m(motion, then[:, None] + steps - start_s[0])
@@ -242,12 +246,12 @@ class BlockPaths:
 def _blocks(
     paths: BlockPaths, ramps: _Ramps, amplitude: Tensor, error: SweepError | None, dtype: torch.dtype
 ) -> Tensor:
-    """Sum over scatterers, one after the other, in blocks of the record."""
+    """Sum over scatterers, one after the other, for blocks of the record."""
     total, motion = 0.0, paths.motion_m()
     for target in range(paths.start_m.shape[-1]):
         turns = reduced_turns(ramps.turns(paths.delay_s(target, motion), error))
         weight = amplitude[..., target, None, None] * paths.lit[..., target, None]
-        if ramps.radar.detection == "real":  # by one cosine
+        if ramps.radar.detection == "real":  # a real echo is one cosine
             angle = (2 * math.pi * turns + torch.angle(weight)).to(real_dtype(dtype))
             total = total + torch.cos(angle) * weight.abs().to(real_dtype(dtype))
         else:
@@ -256,7 +260,7 @@ def _blocks(
 
 
 def _level(log_amplitude: Callable[[Tensor], Tensor], start_s: Tensor, length_s: float, n: int) -> Tensor:
-    """exp(chi) with chi along a straight line in each block, (*trials, pulse, n)."""
+    """Amplitude exp(chi), (*trials, pulse, n), where chi follows a straight line in each block."""
     first, last = log_amplitude(start_s), log_amplitude(start_s + length_s)
     share = torch.linspace(0, 1, n, dtype=torch.float64, device=start_s.device)
     return torch.exp(first[..., None] + (last - first)[..., None] * share)
@@ -265,7 +269,7 @@ def _level(log_amplitude: Callable[[Tensor], Tensor], start_s: Tensor, length_s:
 def _refuse_record(
     s: Scatterers, radar: TriangularLadar, n_period: int, motion: Sequence[Motion], without: Sequence[Effect]
 ) -> None:
-    """Raise ValueError for beat frequencies that a record cannot hold."""
+    """Raise ValueError for beat frequencies that a record cannot represent."""
     pulse = radar.sweep_axes(n_period)[1]
     middle_s = sweep_middles(radar, pulse, s.range_m.device)
     history = RangeHistory(s, radar, motion, pulse.start, without)
@@ -274,7 +278,7 @@ def _refuse_record(
     refuse_beats(beat, contributing, radar)
     if radar.detection != "real":
         return
-    # real samples have no sign of frequency
+    # for real samples, the sign of a frequency is lost
     up = beat.detach() * torch.tensor([1.0, -1.0], dtype=torch.float64, device=beat.device)[:, None, None]
     low = float(torch.where(contributing, up, math.inf).min())
     high = float(torch.where(contributing, up, -math.inf).max())

@@ -18,25 +18,28 @@ from torchsar.core import Draws, Recording
 from torchsar.echo.recorded import with_samples
 from torchsar.scene.trials import refuse_other_trials, refuse_unless
 
-# line number of padding at the end of a trial, by convention: no line has a negative number
+# line number of padding at the end of a trial, by convention, because no line has a negative number
 PADDING = -1
 
 
 def _numbers(recording: Recording) -> Tensor:
-    """Line numbers (*trials, pulse), 0, 1, ... where the recording has none."""
+    """Line numbers (*trials, pulse); 0, 1, ... if the recording has none."""
     data = recording.signal.data
     number = recording.aux.get("line_number", torch.arange(data.shape[-2], device=data.device))
     return number.to(torch.int64).expand(data.shape[:-1])
 
 
 def _valid_count(number: Tensor, draws: Draws) -> Tensor:
-    """Number of lines of each trial (trial,), or () of all where the draws have other trials."""
+    """Number of valid lines of each trial, (trial,).
+
+    If the draws have other trials, it is the smallest number of all trials, ().
+    """
     have = (number != PADDING).sum(-1)
     return have if draws.trials is not None and have.shape == (len(draws.trials),) else have.min()
 
 
 def _order(draws: Draws, purpose: str, n: Tensor, number: Tensor) -> Tensor:
-    """The numbers 0..n-1 in random order for each trial, (*trials, largest n)."""
+    """Numbers 0..n-1 in random order for each trial, (*trials, largest n)."""
     order = draws.permutation(purpose, n.tolist(), number.device)
     if order.shape[:-1] not in ((), number.shape[:-1]):
         raise ValueError(
@@ -47,7 +50,7 @@ def _order(draws: Draws, purpose: str, n: Tensor, number: Tensor) -> Tensor:
 
 
 def _at(index: Tensor, n: int) -> Tensor:
-    """Bool mask (..., n) of row indices (..., k)."""
+    """Boolean mask (..., n) that is True at row indices (..., k)."""
     return torch.zeros((*index.shape[:-1], n), dtype=torch.bool, device=index.device).scatter(-1, index, True)
 
 
@@ -75,7 +78,7 @@ def take_lines(recording: Recording, source: Tensor) -> Recording:
 
 
 def _drop(recording: Recording, lost: Tensor) -> tuple[Recording, dict[str, Tensor]]:
-    """Remove the lines under a mask (*trials, pulse); the others close up."""
+    """Remove the lines under a mask (*trials, pulse); later lines move up."""
     n, number = lost.shape[-1], _numbers(recording)
     order = lost.to(torch.int8).argsort(dim=-1, stable=True)
     row = torch.arange(n, device=lost.device)
@@ -91,7 +94,7 @@ def _drop(recording: Recording, lost: Tensor) -> tuple[Recording, dict[str, Tens
 
 @dataclass(frozen=True)
 class _Lost:
-    """Base of impairments that lose lines, by their number or by a fraction."""
+    """Base of the impairments in which lines are lost, given by their number or by a fraction."""
 
     count: int | None = None
     fraction: Tensor | float | None = None
@@ -110,7 +113,9 @@ class _Lost:
             refuse_unless(sentence, self.fraction, lambda x: (x >= 0) & (x < 1))
 
     def _number(self, have: Tensor, like: Tensor) -> Tensor:
-        """How many of the lines (...,) are lost, float64; ValueError if none would be left."""
+        """Number of the lines (...,) that are lost, float64. Raises ValueError if none would be
+        left.
+        """
         lost = have.to(torch.float64)
         if self.count is not None:
             lost = torch.full_like(lost, self.count)
@@ -240,7 +245,8 @@ class LostGaps:
                 f"{self.count} gaps of {self.length} lines do not fit a recording of {int(have.min())} lines; "
                 "lose fewer or shorter ones"
             )
-        # a gap begins after a kept line: kept lines are chosen, then the gaps are opened
+        # A gap begins after a received line. The received lines before gaps are chosen first, and
+        # then the gaps are inserted.
         kept = _order(draws, "echo.lines.gaps", free - 1, number)[..., : self.count].sort(-1).values
         begin = 1 + kept + self.length * torch.arange(self.count, device=number.device)
         index = (begin[..., None] + torch.arange(self.length, device=number.device)).flatten(-2)
@@ -286,7 +292,7 @@ class RepeatedLines:
                 "repeat fewer"
             )
         repeat = _at(_order(draws, "echo.lines.repeated", have - self.count, number)[..., : self.count], n)
-        # line i follows all copies of the lines before it; its own copy follows it
+        # line i comes after all copies of the lines before it, and its own copy comes after it
         landing = torch.arange(n, device=number.device) + repeat.cumsum(-1) - repeat.long()
         starts = torch.zeros((*number.shape[:-1], 2 * n), dtype=torch.int64, device=number.device).scatter(
             -1, landing, 1

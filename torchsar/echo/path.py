@@ -16,7 +16,7 @@ from torchsar.radar import AntennaPath, InverseRadar, StraightTrack, frequency_s
 from torchsar.scene import PathWorld, Sway
 from torchsar.scene.trials import refuse_other_trials
 
-# amplitude gain from which a target is lit: half power of each of two ways
+# amplitude gain above which a target counts as lit: half power on each of two ways
 _LIT = 0.5
 
 
@@ -201,7 +201,7 @@ def simulate_path(
 
 @dataclass(frozen=True)
 class _Flown:
-    """True and recorded paths, which share the reference."""
+    """True and recorded paths, which have the same reference."""
 
     true: AntennaPath
     recorded: AntennaPath
@@ -209,7 +209,7 @@ class _Flown:
 
     @staticmethod
     def of(world: PathWorld, draws: Draws, time_s: Tensor) -> _Flown:
-        """Draw the flights and what navigation records of them."""
+        """Draw the flights and the paths that navigation records."""
         span_s = float(time_s[-1] - time_s[0])
         true, recorded = [], []
         flights = (("transmitter", world.transmitter, world.navigation),)
@@ -235,8 +235,9 @@ class _Flown:
 
 
 def _line_of_sight_m(recorded: AntennaPath, true: AntennaPath, strip: bool = False) -> Tensor:
-    """Half the path over the point (0, 0, 0), recorded minus true, (..., pulse); for a strip over
-    the points abeam of the mean path of all trials.
+    """Half the path over the point (0, 0, 0), recorded minus true, (..., pulse).
+
+    For a strip, it is that over the points abeam of the mean path of all trials.
     """
     middle = true.transmitter_m.new_zeros(1, 3)
     if strip:
@@ -310,7 +311,7 @@ class PathError:
 
 
 def _gain(world: PathWorld, antennas: AntennaPath, points: Tensor, time_s: Tensor) -> Tensor:
-    """Gain of all ways that have a beam, (..., pulse or 1, point)."""
+    """Product of the antenna gains of all ways that have a beam, (..., pulse or 1, point)."""
     if world.beam is None:
         return points.new_ones(1, 1)
     flight = world.transmitter if world.receiver is None else world.receiver
@@ -326,7 +327,9 @@ def _gain(world: PathWorld, antennas: AntennaPath, points: Tensor, time_s: Tenso
 
 
 def _lit_power(history: Tensor, gain: Tensor) -> Tensor:
-    """Mean power of the samples of pulses in which a target is lit, of all if none is, (...,)."""
+    """Mean power (...,) of the samples in pulses in which a target is lit, or in all pulses if none
+    is lit.
+    """
     power = torch.view_as_real(history).double().square().sum(-1).mean(-1)
     lit = (gain >= _LIT).any(-1).expand(power.shape)
     lit = lit | ~lit.any(-1, keepdim=True)
@@ -334,8 +337,8 @@ def _lit_power(history: Tensor, gain: Tensor) -> Tensor:
 
 
 def _within(antennas: AntennaPath, points: Tensor, gain: Tensor, radar: InverseRadar, n_range: int) -> Tensor:
-    """Whether the window holds the echo of each scatterer, (..., pulse, point); ValueError if it
-    leaves the window while it is lit.
+    """True if the window contains the echo of a scatterer, (..., pulse, point). Raises ValueError
+    if an echo leaves the window while the scatterer is lit.
     """
     off = antennas.path_m(points[..., None, :, :]).detach() / 2
     half = n_range * radar.range_step_m / 2

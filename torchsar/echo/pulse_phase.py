@@ -15,7 +15,9 @@ from torchsar.scene.trials import finite_numbers, refuse_other_trials, with_dims
 
 
 def _turned(recording: Recording, phase_rad: Tensor) -> tuple[Recording, Mapping[str, Tensor]]:
-    """The recording with every pulse multiplied by exp(j phase), and the truth `phase_rad`."""
+    """Multiply every pulse of a recording by exp(j phase), and return the recording with the true
+    value `phase_rad`.
+    """
     data = recording.signal.data
     phase = phase_rad.to(data.device).expand(data.shape[:-1])
     turned = data * unit_phasor(phase / (2 * math.pi), data.dtype)[..., None]

@@ -30,21 +30,25 @@ def _with_lines(recording: Recording, lines: Tensor) -> Recording:
 
 
 def _behind(recording: Recording, x: Tensor, dims: int) -> Tensor:
-    """Numbers (..., *dims) of each trial, with a dimension of length one for each further axis."""
+    """Insert dimensions of length one for the further axes into numbers (..., *dims) of
+    each trial.
+    """
     further = max(2, len(recording.signal.axes)) - 2
     return x.reshape(*x.shape[: x.ndim - dims], *[1] * further, *x.shape[x.ndim - dims :])
 
 
 def _added(recording: Recording, wave: Tensor, over_signal_db: Tensor | float) -> tuple[Recording, Tensor]:
-    """The recording plus a wave (..., pulse, sample) of unit power, at a level over its power, and
-    the power of the wave, (...,).
+    """Add a wave (..., pulse, sample) of unit power to a recording, at a level relative to its
+    power.
+
+    Also returns the power of the wave, (...,).
     """
     lines = _lines(recording)
     dims = tuple(range(-max(2, len(recording.signal.axes)), 0))
     power = lines.abs().square().mean(dims, keepdim=True).to(torch.float64)
     power = power * 10 ** (per_trial(over_signal_db, -dims[0], lines) / 10)
     wave = _behind(recording, wave, 2)
-    # a detector of one channel records the real part, which has half of the power
+    # a detector with one channel records the real part, which has half of the power
     wave = wave if lines.is_complex() else math.sqrt(2) * wave.real
     wave = wave.to(lines.dtype) * power.sqrt().to(lines.real.dtype)
     return _with_lines(recording, lines + wave), power.flatten(dims[0])[..., 0]
@@ -145,7 +149,8 @@ class GroundAtRest:
         refuse_other_trials(self, draws, recording)
         lines = _lines(recording)
         n_pulse, n = lines.shape[-2:]
-        # cut out of a longer periodic process, so that the ends of the record do not join
+        # the noise is cut out of a longer periodic process, so that the ends of the record do not
+        # join
         noise = draws.normal("ground.spectrum", (2 * n_pulse, n), torch.complex128, lines.device)
         band = per_trial(self.band_cycles, 2, lines)
         frequency = torch.fft.fftfreq(2 * n_pulse, dtype=torch.float64, device=lines.device)[:, None].abs()

@@ -138,5 +138,5 @@ def smooth_response(
 
 
 def _band(device: torch.device) -> Tensor:
-    """Normalised frequencies -1..1 over the band, 1025 as in `torchsar.repair`, (1025,)."""
+    """Normalised frequencies -1..1 over the band, (1025,), as in `torchsar.repair`."""
     return torch.linspace(-1, 1, 1025, dtype=torch.float64, device=device)

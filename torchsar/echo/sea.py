@@ -39,7 +39,8 @@ from torchsar.scene.trials import refuse_other_trials
 # largest sine of the look angle that is illuminated, by choice: towards 1 the range grows without
 # bounds
 _STEEPEST = 0.8
-# cells beyond a frame whose range responses are included, by choice: a sinc has fallen to -34 dB
+# number of cells beyond a frame whose range responses are included, by choice; there a sinc has
+# fallen to -34 dB
 _SKIRT = 16
 
 
@@ -71,12 +72,11 @@ def sea_echo(
         radar: Radar parameters.
         n_pulse: Number of pulses.
         n_range: Number of range samples; None for azimuth data at the reference range only.
-        gate: Illumination. `BandLimited` of duration T illuminates the Doppler band
-            |f| < V^2 T / (2 lambda R0) at every range, as a beam of fixed width does; here V is the
-            speed of the receiver and R0 the reference range. `Pattern` weights with
-            sinc(element_m sin(look) / lambda) up to null number `sea.lobes` on either side, with
-            the look angle from broadside. duration_s or element_m must be one number for all
-            trials.
+        gate: Illumination. `BandLimited` of duration T illuminates the Doppler band |f| < V^2 T /
+            (2 lambda R0) at every range, as a beam of fixed width does. Here V is the speed of the
+            receiver and R0 the reference range. `Pattern` weights with sinc(element_m sin(look) /
+            lambda) up to null number `sea.lobes` on either side, with the look angle from
+            broadside. duration_s or element_m must be one number for all trials.
         draws: Random draws.
         dtype: Complex dtype of the result.
         device: Device of the result.
@@ -113,15 +113,17 @@ def sea_echo(
 
 @dataclass(frozen=True)
 class _Light:
-    """Gain of a gate over the sine of the look angle, its edge (half power) and its end."""
+    """Gain of a gate as a function of the sine of the look angle, its edge (half power) and its
+    end.
+    """
 
     weight: Callable[[Tensor], Tensor]
     edge_sin: float  # end of a band-limited gate, or half power of a pattern
-    last_sin: float  # beyond it nothing is illuminated
+    last_sin: float  # nothing is illuminated beyond this sine
 
     @staticmethod
     def of(gate: BandLimited | Pattern, radar: BistaticRadar, lobes: int) -> _Light:
-        """The gain of a gate; raises TypeError or ValueError for an unsuitable gate."""
+        """Describe the gain of a gate. Raises TypeError or ValueError for an unsuitable gate."""
         if isinstance(gate, BandLimited):
             duration_s = _of_all_trials(gate.duration_s, "duration_s")
             edge = radar.speed_m_s * duration_s / (2 * radar.reference_range_m)
@@ -135,14 +137,16 @@ class _Light:
         if isinstance(gate, Pattern):
             element = radar.element_m if gate.element_m is None else _of_all_trials(gate.element_m, "element_m")
             null = radar.wavelength_m / element
-            # sinc^2(0.443) = 1/2, in units of the first null
+            # in units of the first null, half power is at 0.443: sinc^2(0.443) = 1/2
             edge, last = (min(share * null, _STEEPEST) for share in (0.443, lobes))
             return _Light(lambda sine: torch.sinc(sine / null), edge, last)
         raise TypeError(f"gate of a sea must be BandLimited(duration_s) or Pattern(), got {gate!r}")
 
 
 def _of_all_trials(value: Tensor | float, name: str) -> float:
-    """The number of a gate; raises ValueError for a value per trial, as it decides the grid."""
+    """Number that a gate has for all trials. Raises ValueError for a value per trial, because the
+    value determines the size of the grid.
+    """
     if isinstance(value, Tensor) and value.numel() != 1:
         raise ValueError(
             f"{name} of the gate of a sea must be one number, since it decides how many cells there are, "
@@ -153,7 +157,7 @@ def _of_all_trials(value: Tensor | float, name: str) -> float:
 
 @dataclass(frozen=True)
 class _Lines:
-    """Range cells and range frequencies of a frame; samples count from its middle."""
+    """Range cells and range frequencies of a frame. Sample numbers are relative to its middle."""
 
     first: int
     cells: int
@@ -166,7 +170,9 @@ class _Lines:
 
     @staticmethod
     def of(radar: BistaticRadar, n_range: int | None, last_sin: float) -> _Lines:
-        """All cells that migrate through a frame, and an FFT in which they do not wrap into it."""
+        """Choose all cells that migrate through a frame, and an FFT in which they do not wrap into
+        it.
+        """
         step, middle = radar.range_step_m, radar.reference_range_m
         if n_range is None:
             return _Lines(0, 1, 1, 1, step, radar.sampling_hz, radar.pulse.bandwidth_hz, middle)
@@ -203,32 +209,34 @@ class _Lines:
         return f[share > 0], share[share > 0]
 
     def centre_turns(self, cell: _Transfer, radar: BistaticRadar) -> Tensor:
-        """Cycles of the middle cell relative to the reference range, without large differences."""
+        """Phase of the middle cell in cycles relative to the reference range, computed without
+        differences of large numbers.
+        """
         offset_m = (self.first + self.cells // 2) * self.step_m
         return -(cell.bend * radar.reference_range_m + cell.wavenumber * offset_m)
 
     def sample_power(self, cell: _Transfer, times: Tensor) -> Tensor:
-        """Share of some bins in the mean power of a sample, for cells of unit power."""
-        # a cell of closest range is 1 / cos(look) as long on the range axis, so that fewer share a
-        # sample; `times` counts each row
+        """Mean power of a sample due to some Doppler bins, for cells of unit power."""
+        # A cell of closest range extends over 1 / cos(look) as much on the range axis, so that
+        # fewer cells contribute to a sample. `times` is the number of bins of each row.
         power = times @ cell.gain.square() if self.cells == 1 else times @ (cell.gain.square() * cell.cos)
         return power.sum() / self.length
 
 
 @dataclass(frozen=True)
 class _Transfer:
-    """Spectrum of a cell, equal at Doppler f and -f, (row, frequency), float64."""
+    """Spectrum of a cell, which is equal at Doppler f and -f, (row, frequency), float64."""
 
     gain: Tensor
-    cos: Tensor  # of the look angle
+    cos: Tensor  # cosine of the look angle
     wavenumber: Tensor  # cycles per metre of closest range
-    bend: Tensor  # wavenumber - F / c
+    bend: Tensor  # difference `wavenumber` - F / c
 
     @staticmethod
     def of(doppler_hz: Tensor, frequency_hz: Tensor, share: Tensor, radar: BistaticRadar, light: _Light) -> _Transfer:
-        """The spectrum of a cell by stationary phase, without the factor of its range."""
-        # a cell is illuminated per Doppler for lambda R0 / (V^2 cos^3(look)), whose square root is
-        # its amplitude by stationary phase
+        """Compute the spectrum of a cell by stationary phase, without the factor of its range."""
+        # A cell is illuminated for lambda R0 / (V^2 cos^3(look)) per Doppler interval. The root of
+        # it is the amplitude by stationary phase.
         f = radar.carrier_hz + frequency_hz
         sine = -radar.wave_speed_m_s * doppler_hz / (f * radar.speed_m_s)
         lit = sine.abs() <= light.last_sin * (1 + 1e-12)
@@ -241,7 +249,7 @@ class _Transfer:
 
 @dataclass(frozen=True)
 class _Bins:
-    """Doppler bins: `bands` times the pulse rate, `pulses` bins in each, covering the record."""
+    """Doppler bins that cover `bands` pulse rates, with `pulses` bins in each."""
 
     bands: int
     pulses: int
@@ -250,7 +258,7 @@ class _Bins:
 
     @staticmethod
     def of(sea: Sea, radar: BistaticRadar, n_pulse: int, light: _Light, lines: _Lines) -> _Bins:
-        """The Doppler bins of a record with its margins."""
+        """Choose the Doppler bins of a record with its margins."""
         tangent = light.edge_sin / math.sqrt(1 - light.edge_sin**2)
         margin_s = lines.far_m * tangent / radar.speed_m_s if sea.margin_s is None else sea.margin_s
         highest_hz = (
@@ -271,28 +279,33 @@ class _Bins:
         )
 
     def doppler_hz(self, row: Tensor) -> Tensor:
-        """Doppler frequency of rows, counted from zero in either direction."""
+        """Doppler frequency of rows, which are numbered from zero Doppler in either direction."""
         return row.to(torch.float64) * (self.prf_hz / self.pulses)
 
     def times(self, row: Tensor) -> Tensor:
-        """2 for rows that exist at Doppler f and at -f, otherwise 1."""
+        """Number of bins of a row: 2 for rows that exist at Doppler f and -f, otherwise 1."""
         return 2.0 - ((row == 0) | (2 * row == self.n)).to(torch.float64)
 
     def in_order(self, pairs: Tensor) -> Tensor:
-        """Bins in FFT order (..., n, frequency) from rows at f and -f, (..., 2, row, frequency)."""
+        """Arrange bins in FFT order (..., n, frequency), from rows at f and -f, (..., 2, row,
+        frequency).
+        """
         return torch.cat([pairs[..., 0, : (self.n + 1) // 2, :], pairs[..., 1, 1 : self.n // 2 + 1, :].flip(-2)], -2)
 
     def blocks(self, lines: _Lines, device: torch.device | str | None) -> Iterator[Tensor]:
-        """Blocks of rows, independent of the number of trials, so that sums round equally."""
-        # phasors of a block, 16 MB in complex128
+        """Blocks of rows. Their size does not depend on the number of trials, so that sums are
+        rounded alike.
+        """
+        # phasors of a block take 16 MB in complex128
         size = 2 * lines.length * (1 + math.isqrt(lines.cells))
         yield from torch.arange(self.n // 2 + 1, device=device).split(max(1, (1 << 20) // size))
 
 
 def _sum_over_range(cells: Tensor, turns: Tensor, dtype: torch.dtype) -> Tensor:
-    """sum_j cells_j exp(2j pi turns (j - n // 2)): (..., 2, row, n) -> (..., 2, row, frequency).
+    """Sums over range sum_j cells_j exp(2j pi turns (j - n // 2)), (..., 2, row, frequency), of
+    cells (..., 2, row, n).
 
-    One trial after the other, so that sums round equally in batches of every size.
+    Trials are processed one after the other, so that sums are rounded alike in batches of any size.
     """
     n = cells.shape[-1]
     coarse, fine = line_tables(turns, n, -(n // 2), dtype)
@@ -305,7 +318,7 @@ def _sum_over_range(cells: Tensor, turns: Tensor, dtype: torch.dtype) -> Tensor:
 
 
 def _fold(spectra: Tensor, bins: _Bins, radar: BistaticRadar) -> Tensor:
-    """Spectra of the channels at the pulse rate, (..., channel, pulse, frequency)."""
+    """Spectra of the channels, folded to the pulse rate, (..., channel, pulse, frequency)."""
     order = torch.fft.fftfreq(bins.n, 1 / bins.n, dtype=torch.float64, device=spectra.device)
     delay_s = radar.channels_at(spectra.device) / radar.speed_m_s
     steering = unit_phasor(-bins.doppler_hz(order) * delay_s[:, None], spectra.dtype)[..., None]
@@ -313,7 +326,9 @@ def _fold(spectra: Tensor, bins: _Bins, radar: BistaticRadar) -> Tensor:
 
 
 def _to_time(spectrum: Tensor, n_pulse: int, lines: _Lines) -> Tensor:
-    """Samples of a frame about slow time zero and the reference range, from in-band spectra."""
+    """Samples of a frame around slow time zero and the reference range, from spectra within the
+    band.
+    """
     positive = (spectrum.shape[-1] + 1) // 2
     gap = spectrum.new_zeros((*spectrum.shape[:-1], lines.length - spectrum.shape[-1]))
     data = torch.fft.ifft(torch.cat([spectrum[..., :positive], gap, spectrum[..., positive:]], -1))

@@ -17,7 +17,7 @@ from torchsar.radar import StripmapRadar
 from torchsar.scene import Scatterers, StripmapWorld
 from torchsar.scene.trials import refuse_other_trials
 
-# phase tables of a block of pulses and targets, about the cache of a processor
+# size of the phase tables of a block of pulses and targets, about that of the cache of a processor
 _TABLE_BYTES = 8 << 20
 
 
@@ -114,7 +114,7 @@ def stripmap_echo(
     fits = _fits(placed, radar, n_range)
     if not bool(fits.any()):
         return echo
-    # where only some trials need a longer FFT, each has the one that it would have alone
+    # if only some trials need a longer FFT, each trial has the FFT that it would have alone
     return torch.where(fits[..., None, None], _lines(placed, world, radar, n_pulse, n_range, n_range, dtype), echo)
 
 
@@ -127,7 +127,7 @@ def _lines(
     n_fft: int,
     dtype: torch.dtype,
 ) -> Tensor:
-    """Raw lines (..., pulse, range) by FFTs of n_fft samples."""
+    """Raw lines (..., pulse, range), computed by FFTs of n_fft samples."""
     spectrum = torch.fft.fftshift(radar.pulse.spectrum(n_fft, radar.sampling_hz, placed.closest_m.device)).to(dtype)
     lines = []
     slow_s = torch.arange(n_pulse, dtype=torch.float64, device=placed.closest_m.device) / radar.prf_hz
@@ -148,8 +148,8 @@ def _block_spectrum(
     width = max(16, _TABLE_BYTES // (8 * pulse_s.numel() * 3 * math.isqrt(n_fft)))
     for targets in (slice(first, first + width) for first in range(0, count, width)):
         since, closest, weight = _times_and_gain(placed, targets, world, radar, pulse_s, doppler, velocity)
-        # all of few targets, so that the sum of a trial does not depend on other trials; else those
-        # that any pulse of any trial illuminates
+        # With few targets all are summed, so that the sum of a trial does not depend on other
+        # trials. Otherwise those are summed that any pulse of any trial illuminates.
         lit = slice(None) if count <= width else (weight.detach() != 0).flatten(0, -2).any(0).nonzero()[:, 0]
         since, closest, weight = (x[..., lit] for x in (since, closest, weight))
         if not since.shape[-1]:
@@ -183,12 +183,14 @@ def _times_and_gain(
 
 
 def _true_doppler(world: StripmapWorld, radar: StripmapRadar) -> Tensor | float:
-    """Doppler frequency of the beam centre of the world, by default that of the radar."""
+    """Doppler frequency of the beam centre in the world; by default it is that of the radar."""
     return (radar.pointing_doppler_hz or 0.0) if world.doppler_hz is None else world.doppler_hz
 
 
 def _line_length(placed: Placed, radar: StripmapRadar, n_range: int) -> int:
-    """FFT length in which no echo wraps: the line itself if all fit, else one pulse longer."""
+    """FFT length in which no echo wraps: the line itself if all echoes fit into it, otherwise one
+    pulse more.
+    """
     first, last = (
         2 * (float(closest) - radar.near_range_m) / radar.wave_speed_m_s * radar.sampling_hz
         for closest in placed.closest_m.detach().aminmax()
@@ -199,14 +201,14 @@ def _line_length(placed: Placed, radar: StripmapRadar, n_range: int) -> int:
 
 
 def _fits(placed: Placed, radar: StripmapRadar, n_range: int) -> Tensor:
-    """Whether all echoes of a trial lie inside the line, (...,) bool."""
+    """True if all echoes of a trial lie inside the line, (...,) bool."""
     nearest, farthest = placed.closest_m.detach().aminmax(dim=-1)
     last_m = radar.near_range_m + (n_range - _margin(radar)) * radar.range_step_m
     return (nearest >= radar.near_range_m) & (farthest <= last_m)
 
 
 def _margin(radar: StripmapRadar) -> int:
-    """Samples of a pulse and, by choice, 256 samples of range migration."""
+    """Number of samples of a pulse and of 256 samples of range migration, by choice."""
     return 256 + radar.pulse_samples
 
 

@@ -1,4 +1,6 @@
-"""Sums of exponentials over targets, which all echoes are made of, in blocks that fit the cache."""
+"""Sums of exponentials over targets, of which all echoes consist, in blocks that fit into the
+cache.
+"""
 
 from __future__ import annotations
 

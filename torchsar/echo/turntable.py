@@ -83,8 +83,8 @@ def turntable_echo(
         angle = theta[..., pulses, None]
         path = x[..., None, :] * torch.sin(angle) - lever[..., None, :] * (2 * torch.sin(angle / 2).square())
         lines = unit_phasor(-2 / radar.wavelength_m * path, dtype) @ spectra
-        # centred in both domains: sample n_range // 2 is range zero; in blocks, while the lines are
-        # in the cache
+        # Both domains are centred, so that sample n_range // 2 is at range zero. The transform is
+        # made in blocks, while the lines are in the cache.
         parts.append(torch.fft.fftshift(torch.fft.ifft(torch.fft.ifftshift(lines, dim=-1)), dim=-1))
     return torch.cat(parts, -2)
 
@@ -205,7 +205,7 @@ class _Course:
         draws: Draws,
         device: torch.device | str | None,
     ) -> _Course:
-        """Draw the target and its motion; raises ValueError for impossible ones."""
+        """Draw the target and its motion. Raises ValueError for impossible ones."""
         choices = (world.rotation, world.rotation_rad_s, radar.rotation_rad_s)
         rotation = next((choice for choice in choices if choice is not None), None)
         if rotation is None:
@@ -239,7 +239,9 @@ _Simulated = tuple[Tensor, Tensor, Tensor, tuple[Axis, ...], dict[str, Tensor]]
 def _phase_only(
     radar: InverseRadar, world: TurntableWorld, course: _Course, n_range: int, draws: Draws, dtype: torch.dtype
 ) -> _Simulated:
-    """Clean and recorded samples, noise standard deviation, axes and side data with `PhaseOnly`."""
+    """Simulate with `PhaseOnly`. Returns clean and recorded samples, noise standard deviation, axes
+    and side data.
+    """
     n_pulse = course.moved_m.shape[-1]
     still = turntable_echo(course.scatterers, radar, n_pulse, n_range, course.rotation, dtype, world.centre_deviation_m)
     added, std = _noise(still, world.snr_db, draws)
@@ -250,7 +252,9 @@ def _phase_only(
 def _dechirped(
     radar: InverseRadar, world: TurntableWorld, course: _Course, n_fast: int, draws: Draws, dtype: torch.dtype
 ) -> _Simulated:
-    """The same with `Dechirped`, where the noise of the receiver has no phase error."""
+    """Simulate with `Dechirped`, in which the noise of the receiver has no phase error. The results
+    are those of `_phase_only`.
+    """
     n_pulse, track = course.moved_m.shape[-1], world.fidelity.track if isinstance(world.fidelity, Dechirped) else ()
     turned = partial(
         dechirped_echo,
@@ -270,12 +274,14 @@ def _dechirped(
 
 
 def _turned(pulses: Tensor, phase_rad: Tensor) -> Tensor:
-    """Pulses multiplied by exp(j phase)."""
+    """Multiply pulses by exp(j phase)."""
     return pulses * unit_phasor(phase_rad / (2 * math.pi), pulses.dtype)[..., None]
 
 
 def _noise(echo: Tensor, snr_db: Tensor | float | None, draws: Draws) -> tuple[Tensor | float, Tensor]:
-    """Circular Gaussian noise of an echo, and its standard deviation (...,)."""
+    """Draw circular Gaussian noise for an echo. Returns the noise and its standard deviation
+    (...,).
+    """
     if snr_db is None:
         return 0.0, torch.zeros((), dtype=torch.float64, device=echo.device)
     power = torch.view_as_real(echo).double().square().sum(-1).mean((-2, -1))
@@ -284,7 +290,9 @@ def _noise(echo: Tensor, snr_db: Tensor | float | None, draws: Draws) -> tuple[T
 
 
 def _refuse_outside(scatterers: Scatterers, off_m: Tensor, radar: InverseRadar, n_range: int) -> None:
-    """Raise ValueError if the target leaves the range window; off_m: (*trials, pulse)."""
+    """Raise ValueError if the target leaves the range window. off_m: displacement, (*trials,
+    pulse).
+    """
     y, off = scatterers.range_m.detach(), off_m.detach()
     nearest, farthest = float((y.amin(-1) + off.amin(-1)).min()), float((y.amax(-1) + off.amax(-1)).max())
     low, high = ((edge - n_range // 2 - 0.5) * radar.range_step_m for edge in (0, n_range))

@@ -1,8 +1,10 @@
-"""Published figures, tables and numbers, made anew and compared: `torchsar reproduce`.
+"""Reproduction of published figures, tables and numbers, and their comparison: `torchsar
+reproduce`.
 
-The catalogue lists every numbered figure and table of the five papers, numbers of their texts and
-what they have wrong, with what makes it, the published numbers, the tolerance of each comparison,
-and the reason of what is not reproduced with the numbers that show it.
+The catalogue lists every numbered figure and table of the five papers, numbers of their texts, and
+their errors. An entry names the experiment that makes the figure, the published numbers, and the
+tolerance of each comparison. For figures and tables that are not reproduced, it gives the reason
+and the numbers that show it.
 """
 
 from __future__ import annotations

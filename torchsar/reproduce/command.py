@@ -45,7 +45,7 @@ def reproduce(papers: str | None, label: str | None, out: Path, small: bool = Fa
 
 
 def _made(one: Paper, wanted: Sequence[Item], entries: dict[str, Any], out: Path, small: bool) -> str:
-    """Make some items of a paper; returns their table."""
+    """Make some items of a paper, and return their table as text."""
     folder, results = out / one.name, dict[Callable[[bool], Any], Any]()
     folder.mkdir(parents=True, exist_ok=True)
     for item in wanted:
@@ -55,7 +55,9 @@ def _made(one: Paper, wanted: Sequence[Item], entries: dict[str, Any], out: Path
 
 
 def _entry(item: Item, path: Path, results: dict[Callable[[bool], Any], Any], small: bool) -> dict[str, Any]:
-    """Make one item, with the result of its experiment where another item already has it."""
+    """Make one item. If another item already has the result of its experiment, the result is
+    reused.
+    """
     if item.make is None or item.of is None:
         return record.entry(item, [], None)
     log.info("%s: %s", item.label, item.subject)

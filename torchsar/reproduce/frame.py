@@ -25,7 +25,7 @@ from torchsar.reproduce.item import Check, Item, given, number, statement
 from torchsar.scene import Dwell, Points, StripmapWorld
 
 log = logging.getLogger("torchsar.reproduce")
-# bandwidth and integration time of the paper; the others by choice
+# bandwidth and integration time are those of the paper; the other values are a choice
 SENSOR = StripmapRadar(
     carrier_hz=3.2e9,
     pulse=LinearFM(bandwidth_hz=200e6, duration_s=3e-6),
@@ -38,13 +38,13 @@ SENSOR = StripmapRadar(
 )
 # integration time (s) and middle of the swath (m)
 DWELL_S, RANGE_M = 1.5, 700e3
-# lines and samples of frame and aperture or pulse, in the full and the reduced form
+# (lines, samples) of the full frame and, in the reduced form, of an aperture and a pulse
 SIZES = {False: (11_720, 17_500), True: (7_000, 1_400)}
 
 
 class _Frame(NamedTuple):
-    """Processor and wall time (s), threads, peak of the memory of the process (GB), error of the
-    velocity (m/s) and number of samples.
+    """Measurements of the processing of a frame: CPU and wall time (s), threads, peak memory of the
+    process (GB), error of the velocity (m/s), and number of samples.
     """
 
     processor_s: float
@@ -75,7 +75,9 @@ def _raw(lines: int, samples: int, off_m_s: float, slab: int = 1024, step: int =
 
 
 def _frame(small: bool, off_m_s: float = 2.0, width: int = 1024) -> _Frame:
-    """Doppler centroid and velocity are estimated from this many range samples in the middle."""
+    """Process a frame; Doppler centroid and velocity are estimated from `width` range samples in
+    the middle.
+    """
     lines, samples = SIZES[small]
     raw = _raw(lines, samples, off_m_s)
     focus, doppler = OmegaK(SENSOR), DopplerCentroid(SENSOR)
@@ -92,7 +94,7 @@ def _frame(small: bool, off_m_s: float = 2.0, width: int = 1024) -> _Frame:
     log.info("frame: modulus")
     amplitude = Detect()(image)
     spent = time.process_time() - began[0], time.perf_counter() - began[1]
-    import resource  # of the operating systems that have it
+    import resource  # this module does not exist on all operating systems
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
     off = float(speed) - SENSOR.velocity_m_s - off_m_s
@@ -136,7 +138,7 @@ def _parabola() -> Check:
 
 
 def _velocity_error() -> float:
-    """Error of the velocity that leaves pi / 4 at the ends of the aperture."""
+    """Error of the velocity that causes a phase of pi / 4 at the ends of the aperture."""
     quadratic = 4 * math.pi / SENSOR.wavelength_m * _half_aperture_m() ** 2 / (2 * RANGE_M)
     return math.pi / 4 * SENSOR.velocity_m_s / (2 * quadratic)
 

@@ -25,9 +25,9 @@ from torchsar.study.trials.bench import Bench
 
 __all__ = ["PAPER"]
 
-# methods of the config by their names in the paper; the last one is ours
+# names of methods in the paper -> names in the config; the last method is not in the paper
 METHODS = {"polluted": "none", "PGA": "pga_lumv", "SCA": "sca", "PGA-SCA": "pga_sca", "recommended": "recommended"}
-# Table 1, entropies (nats) by case, in the order of METHODS
+# entropies (nats) of Table 1 by case, in the order of METHODS
 TABLE_1 = {
     "1_0.1_90": (8.4843, 7.2063, 8.5877, 7.2555),
     "1_100_90": (9.2879, 9.6256, 8.5800, 7.3582),
@@ -36,9 +36,10 @@ TABLE_1 = {
 }
 # cases with random phases
 RANDOM = ("sigma 2 pi", "1_100_60, sigma pi")
-# tolerance (nats): what the choice of the target and its position between samples change
+# tolerance (nats) for the choice of the target and of its position between samples
 WITHIN = 0.3
-# nats above the error-free image below which an image is focused, and above which it is not
+# entropy (nats) above that of the error-free image below which an image counts as focused, and
+# above which it does not
 FOCUSED, DEFOCUSED = 0.3, 0.6
 
 
@@ -51,7 +52,7 @@ class _Seen(NamedTuple):
         return self.batches[case].outcomes[method].metrics["entropy_nats"].tolist()
 
     def above(self, case: str, method: str) -> float:
-        """Mean nats above the error-free image."""
+        """Mean entropy above that of the error-free image, in nats."""
         gaps = np.array(self.entropies(case, method)) - np.array(self.entropies(case, "ideal"))
         return float(gaps.mean())
 
@@ -98,7 +99,7 @@ def _images(case: str, sharp: tuple[str, ...], blurred: tuple[str, ...]) -> Call
 
 
 def _figure_2(seen: _Seen, path: Path) -> list[Check]:
-    """Nothing is published to compare it with."""
+    """Draw Figure 2, for which there are no published numbers."""
     truth = next(iter(seen.batches.values())).trials.truth
     along, across, level = (plot.array(truth[name][0]) for name in ("range_m", "cross_range_m", "amplitude"))
     plot.save(plot.scatterers(along, across, np.abs(level) ** 2, "range (m)", "cross range (m)", "aircraft"), path)
@@ -106,7 +107,7 @@ def _figure_2(seen: _Seen, path: Path) -> list[Check]:
 
 
 def _figure_5(seen: _Seen, path: Path) -> list[Check]:
-    """The phase errors beside the image."""
+    """Draw the phase errors beside the image."""
     case = "sigma 2 pi"
     batch = seen.batches[case]
     phase = batch.trials.truth["phase_rad"][0].double()
@@ -131,7 +132,7 @@ def _figure_5(seen: _Seen, path: Path) -> list[Check]:
 
 
 def _text_1(seen: _Seen, path: Path) -> list[Check]:
-    """The same in all cases, since it depends on the target alone."""
+    """Check that the entropy is the same in all cases, because it depends on the target only."""
     each = [float(np.mean(seen.entropies(case, "sca"))) for case in TABLE_1]
     ours = f"{min(each):.3f} to {max(each):.3f} nats in {len(each)} cases"
     steady = max(each) - min(each) < 0.02

@@ -13,8 +13,8 @@ import torch
 
 REPRODUCED, BETTER, NOT_REPRODUCED, MISPRINT = "reproduced", "better", "not reproduced", "error of the paper"
 KINDS = ("figure", "table", "text", "erratum", "diagram", "photograph", "unpublished")
-# kinds with nothing that can be compared: they show nothing that can be computed, or what they show
-# is of a recording or a model that is not published
+# Kinds of figures that cannot be compared: they show nothing that can be computed, or a recording
+# or a model that is not published.
 SHOWN = ("diagram", "photograph", "unpublished")
 
 
@@ -33,7 +33,7 @@ def seeds_of(small: bool, draws: int = 5) -> range:
 
 @dataclass(frozen=True)
 class Check:
-    """One published number or statement beside ours.
+    """One published number or statement beside that of this project.
 
     Args:
         name: What is compared, with its unit.
@@ -59,7 +59,7 @@ class Check:
 
 @dataclass(frozen=True)
 class Fact:
-    """One of the numbers on which the reason of what is not reproduced rests.
+    """One of the numbers on which the reason rests why an item is not reproduced.
 
     Args:
         name: Name by which the words of the reason refer to the number.
@@ -75,7 +75,7 @@ class Fact:
 
     @property
     def holds(self) -> bool:
-        """Whether the reason holds with this number."""
+        """True if the reason holds with this number."""
         return self.least <= self.value <= self.most
 
 
@@ -221,7 +221,7 @@ class Item:
 
     @property
     def file(self) -> str:
-        """Name of its picture, such as figure_05.png."""
+        """Name of the file of the picture, such as figure_05.png."""
         word, number = self.label.split()
         return f"{word.lower()}_{int(number):02}.png"
 

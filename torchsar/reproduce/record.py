@@ -1,4 +1,4 @@
-"""Records of reproduced items: what was compared, when, with what and where."""
+"""Records of reproduced items: the comparisons, their time, the versions and the computer."""
 
 from __future__ import annotations
 

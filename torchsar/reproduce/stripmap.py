@@ -31,7 +31,7 @@ from torchsar.scene import Dwell, Points, StripmapWorld
 
 __all__ = ["PAPER"]
 
-# bandwidth of the paper; the rest is chosen, as it gives none of it
+# bandwidth of the paper; the other values are chosen, because the paper does not give them
 RADAR = StripmapRadar(
     carrier_hz=3.2e9,
     pulse=LinearFM(bandwidth_hz=200e6, duration_s=1.5e-6),
@@ -42,26 +42,30 @@ RADAR = StripmapRadar(
     pointing_doppler_hz=1250.0,
     integration_s=0.25,
 )
-# size of the strip, dwell (s), and centroid (Hz) of its beam, which is beyond half the pulse rate
+# size of the strip, dwell (s), and Doppler centroid (Hz) of its beam, which exceeds half the pulse
+# rate
 LINES, SAMPLES, DWELL_S, DOPPLER_HZ = 1024, 1024, 0.25, 1304.0
-# one bright point, and weaker ones about it (m)
+# one bright point, and weaker ones around it (m)
 POINTS = Points(azimuth_m=[0.0, 60.0, -70.0], range_m=[0.0, 40.0, -50.0], amplitude=[1.0, 0.3, 0.3])
 # periodic jitter (samples), and a tone in a twentieth of the lines
 JITTER = PeriodicJitter((-0.0325, 0.1475, -0.1525, 0.0375))
 TONE = Tone(20.0, 31e6, drift_hz=2e6, share=0.05)
-# centroid (Hz) of figure 6, with a part of the Doppler band beyond half the pulse rate
+# Doppler centroid (Hz) of figure 6, for which a part of the Doppler band exceeds half the pulse
+# rate
 WRAPPED_HZ = 950.0
-# points and blocks of lines of figure 5
+# numbers of points, and of blocks of lines, of figure 5
 MANY, BLOCKS = 300, 16
 
 
 def _response_rad(u: Tensor) -> Tensor:
-    """Phase of the channel over the band; -1 and 1 are its edges."""
+    """Phase response of the channel over the band; -1 and 1 are its edges."""
     return 1.2 * u**3 + 0.5 * torch.sin(6 * math.pi * u)
 
 
 class _Strip(NamedTuple):
-    """A recording without impairments, its image, and the place of the bright point in it."""
+    """A recording without impairments, its image, and the position of the bright point in the
+    image.
+    """
 
     recording: Recording
     image: Signal
@@ -77,12 +81,12 @@ class _Strip(NamedTuple):
         return apply_impairments(self.recording, impairments, Draws(self.seed))
 
     def error_db(self, image: Signal) -> float:
-        """Power of the difference to the image without impairments, over its power."""
+        """Relative error (dB) of an image with respect to the image without impairments."""
         gap = (image.data - self.image.data).norm() / self.image.data.norm()
         return 20 * float(torch.log10(gap))
 
     def loss_db(self, image: Signal) -> float:
-        """Peak below that of the image without impairments."""
+        """Level (dB) by which the peak is below that of the image without impairments."""
         return 20 * float(torch.log10(self.image.data.abs().max() / image.data.abs().max()))
 
 
@@ -103,7 +107,7 @@ def _strips(small: bool, doppler_hz: float = DOPPLER_HZ) -> list[_Strip]:
 
 
 def _uneven(small: bool) -> list[Recording]:
-    """Points at random places, wherever the beam looks."""
+    """Recordings of points at random positions, in any direction of the beam."""
     recordings = []
     for seed in seeds_of(small):
         draws = Draws(seed)
@@ -154,7 +158,7 @@ def _figure_3(strips: list[_Strip], path: Path) -> list[Check]:
 
 
 def _jittered(strip: _Strip) -> tuple[Signal, Signal]:
-    """Images with jitter and after its correction."""
+    """Images with jitter, and after the correction of the jitter."""
     impaired, _ = strip.impaired(jitter=JITTER)
     found = PilotJitter()(impaired.signal, impaired.aux["pilot"])
     corrected = CorrectJitter()(impaired.signal, found["offset_samples"], found["period"])
@@ -201,8 +205,10 @@ def _figure_5(recordings: list[Recording], path: Path) -> list[Check]:
 def _lost(
     strips: list[_Strip], wrong_hz: float, names: tuple[str, str], path: Path
 ) -> tuple[float, float, list[float], list[float]]:
-    """Draw images with a wrong and with the estimated centroid; return the least loss (dB) by the
-    wrong one, the largest by the estimated one, and estimated centroids (Hz) and squints (deg).
+    """Draw images with a wrong and with the estimated centroid, and return their losses.
+
+    In this order: the least loss (dB) by the wrong centroid, the largest by the estimated one, and
+    estimated centroids (Hz) and squints (deg).
     """
     found = [DopplerCentroid(RADAR)(strip.recording.signal) for strip in strips]
     centroids = [float(one["doppler_hz"]) for one in found]
@@ -238,7 +244,9 @@ def _figure_7(strips: list[_Strip], path: Path) -> list[Check]:
 
 
 def _distorted(strip: _Strip) -> tuple[Signal, Signal, Tensor, Tensor]:
-    """Image through the channel and after correction; estimated and true phase over the band."""
+    """Image after the channel response and after its correction, and the estimated and the true
+    phase over the band.
+    """
     impaired, true = strip.impaired(response=ChannelResponse(_response_rad))
     image = _focused(impaired.signal, DOPPLER_HZ)
     phase = EstimateResponse(RADAR)(image)["phase_rad"]
@@ -296,7 +304,9 @@ def _figure_9(strips: list[_Strip], path: Path) -> list[Check]:
 
 
 def _step_3a(strips: list[_Strip], path: Path) -> list[Check]:
-    """Change of the migration over half the published frame, and effect on a short strip."""
+    """Compare the change of the range migration over half the published frame with its effect on a
+    short strip.
+    """
     stolt = OmegaKStolt(RADAR, reference="flat", doppler_hz=DOPPLER_HZ)(strips[0].recording.signal)
     change = frame.migration_change_m()
     quarter = frame.SENSOR.wave_speed_m_s / (8 * frame.SENSOR.pulse.bandwidth_hz)

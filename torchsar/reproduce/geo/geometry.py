@@ -28,11 +28,13 @@ from torchsar.reproduce.item import Check, Item, number, statement
 SWATH_M = 500e3
 # chosen: pulse length, guard time, length of the nadir echo (s)
 PULSE_S, GUARD_S, NADIR_S = 10e-6, 50e-6, 200e-6
-LEFT_K1_M_S = -243.0  # of the transmit range, where it stays in the data
+LEFT_K1_M_S = -243.0  # coefficient k1 of the transmit range, if it is left in the data
 
 
 def _timing(small: bool) -> TimingDiagram:
-    """Pulse rates of 160 to 200 Hz over the ground about the middle of the swath."""
+    """Timing diagram for pulse rates of 160 to 200 Hz and ground ranges around the middle of the
+    swath.
+    """
     step_hz, step_m = (0.5, 20e3) if small else (0.025, 5e3)
     return timing_diagram(
         HEIGHT_M,
@@ -49,21 +51,20 @@ def _motion(u_r: Tensor | float, u_a: Tensor | float) -> PointMotion:
 
 
 def _phase_shift_rad(point: PointMotion, left_k1_m_s: float = 0.0) -> Tensor:
-    """Phase of each channel at zero Doppler against the reference, the constant factor of Eq.
-
-    (34), (..., channel).
+    """Phase of each channel at zero Doppler relative to the reference channel, (..., channel): the
+    constant factor of Eq. (34).
     """
     at_centre = torch.angle(shared_response(RADAR, point, 1, 1, torch.complex128, left_k1_m_s))[..., 0]
     return at_centre + 2 * math.pi * doppler_centre_hz(RADAR, point, left_k1_m_s)[..., None] * _delay_s(point)
 
 
 def _delay_s(point: PointMotion) -> Tensor:
-    """Delay of each channel against the reference, dx_m / v_e, (..., channel)."""
+    """Delay of each channel relative to the reference channel, dx_m / v_e, (..., channel)."""
     return RADAR.channels_at() / point.effective_m_s[..., None]
 
 
 def _draw_parameters(speed: Tensor, point: PointMotion, name: str, path: Path) -> None:
-    """Figures 3 and 4: v_e, and delay and phase of channel 3."""
+    """Draw Figures 3 and 4: v_e, and delay and phase of channel 3."""
     label = f"{name} (m/s)"
     shifts = {
         "transmit range removed": _phase_shift_rad(point)[:, 2],
@@ -79,7 +80,7 @@ def _draw_parameters(speed: Tensor, point: PointMotion, name: str, path: Path) -
 
 
 def _draw(speed: Tensor, shown: Mapping[str, tuple[str, str, Mapping[str, Tensor]]], path: Path) -> None:
-    """Panels by title: labels of the axes, and curves over the speed by name."""
+    """Draw panels by title: labels of the axes, and curves over the speed by name."""
     x = plot.array(speed)
     parts = [
         {
@@ -109,18 +110,19 @@ def _worst_phase_rad(u_r: Tensor | float, u_a: Tensor | float) -> Tensor:
 
 
 def _speeds(small: bool) -> Tensor:
-    """0 to 20 m/s; the reduced form is the full one."""
+    """Speeds of 0 to 20 m/s; the reduced form is the same."""
     return torch.linspace(0, 20, 41, dtype=torch.float64)
 
 
 def _figure_2(diagram: TimingDiagram, path: Path) -> list[Check]:
-    # what is lost to nadir echoes (1) and to transmitted pulses (2)
+    # parts of the diagram that are lost: to nadir echoes (1), and to transmitted pulses (2)
     lost = torch.maximum(diagram.nadir.double(), 2 * diagram.transmit.double())
     axes = {"x": plot.array(diagram.prf_hz), "y": plot.array(diagram.ground_m / 1e3), "z": plot.array(lost.mT)}
     title = f"clear swaths of {SWATH_M / 1e3:g} km nearest to {OFF_NADIR_DEG:g} degrees off nadir (white)"
     labels = ("pulse rate (Hz)", "ground from nadir (km)", "0 clear, 1 nadir echo, 2 transmitted pulse")
     (figure,) = plot.heat_map([{"title": title, **axes}], *labels, limits=(0.0, 2.0))
-    # how far from 7 degrees off nadir the middle of the nearest clear swath lies (m), by pulse rate
+    # distance (m) between the middle of the nearest clear swath and the ground at 7 degrees off
+    # nadir, for each pulse rate
     aim, fits = off_nadir_ground_m(HEIGHT_M, OFF_NADIR_DEG), diagram.swath_fits(SWATH_M)
     middles = diagram.ground_m + SWATH_M / 2 - aim
     nearest = middles[torch.where(fits, middles.abs(), torch.inf).argmin(-1)]
@@ -128,7 +130,7 @@ def _figure_2(diagram: TimingDiagram, path: Path) -> list[Check]:
     swaths = {prf: near for prf, near, fit in rows if fit}
     first, step = (float(x) for x in (diagram.ground_m[0], diagram.ground_m[1] - diagram.ground_m[0]))
     for prf, away in swaths.items():
-        if prf % 2 < 1e-9:  # white lines at every second pulse rate
+        if prf % 2 < 1e-9:  # draw white lines at every second pulse rate only
             column = int((diagram.prf_hz == prf).nonzero())
             ends = [(aim + away - first + side * SWATH_M / 2) / step for side in (-1, 1)]
             figure.axes[0].plot([column, column], ends, color="white", linewidth=1.0)

@@ -26,19 +26,19 @@ from torchsar.reproduce.geo.sensor import TRANSMIT_RANGE
 from torchsar.reproduce.item import Check, Item, number, statement
 from torchsar.scene import BandLimited, BistaticWorld, Fleet, KSea, Ship
 
-# the middle of the swath of figure 18, with the range to the satellite in the echo
+# middle of the swath of figure 18; the echo contains the range to the satellite
 RADAR = replace(SENSOR, reference_range_m=5700.0, transmit_range=TRANSMIT_RANGE)
-# displacement and distance of the false target (m)
+# published displacement and distance of the false target (m)
 PUBLISHED = {"ship 2": (216.3, 934.58), "ship 3": (167.6, 723.99)}
-# velocities and ranges as published; places along track are chosen
+# velocities and ranges are published; positions along track are chosen
 SHIPS = {
     "ship 1": Ship(0.0, 0.0, -300.0, 0.0),
     "ship 2": Ship(10.0, 0.0, 0.0, 790.0),
     "ship 3": Ship(10.0, 10.0, 100.0, -840.0),
 }
-# for the reduced form
+# ships of the reduced form
 SMALL = {"ship 2": Ship(10.0, 0.0, 0.0, 0.0, length_m=40.0, range_cells=2, count=6)}
-# chosen: of a ship in its line, and of the sea
+# powers of a ship in its range line, and of the sea, relative to noise, by choice
 SCR_DB, CNR_DB = 10.0, 30.0
 
 
@@ -50,7 +50,7 @@ class _Seen(NamedTuple):
 
 
 def _sea(small: bool) -> _Seen:
-    """As published; one ship, in seconds, in the reduced form."""
+    """Simulate and image the published scene; in the reduced form, one ship in a few seconds."""
     pulses, lines, gate_s, scr_db, ships, flow = 2160, 512, 4.5, SCR_DB, SHIPS, ImageMovers(RADAR)
     if small:
         extraction, detector = Extraction(60.0, 30.0, 2.0, 0.4), Detector(suppressed_m_s=())
@@ -63,7 +63,7 @@ def _sea(small: bool) -> _Seen:
 
 
 def _nearest(ship: Ship, bodies: list[Body]) -> Body | None:
-    """What was found nearest to the middle of a ship, within 50 m."""
+    """Body that was found nearest to the middle of a ship, within 50 m."""
     middle_m = RADAR.reference_range_m + ship.range_m
     away = [float(torch.hypot(b.motion.y0_m - ship.azimuth_m, b.motion.range_m - middle_m)) for b in bodies]
     return bodies[away.index(min(away))] if away and min(away) < 50 else None
@@ -78,7 +78,7 @@ def _predicted(motion: PointMotion) -> tuple[float, float]:
 
 
 def _levelled(image: Signal) -> Signal:
-    """Blocks over their median, from -10 to 25 dB."""
+    """Blocks of pixels relative to their median, limited to -10 to 25 dB."""
     view = plot.quicklook(image, 300)
     level = view.data.abs() / view.data.abs().median()
     return view.with_data(level.clamp(10**-0.5, 10**1.25).to(torch.complex64))

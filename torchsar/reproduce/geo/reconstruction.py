@@ -34,17 +34,18 @@ from torchsar.reproduce.item import Check, Item, falling, misprint, number, stat
 from torchsar.scene import BandLimited, BistaticWorld, MovingPoints, Pattern
 from torchsar.scene.bistatic import Gate
 
-# length of a record (s) that holds all replicas
+# length of a record (s) that contains all replicas
 RECORD_S = 20.0
 GATES: dict[str, Gate] = {"band-limited": BandLimited(INTEGRATION_S), "pattern": Pattern()}
-# velocities of figures 10 and 11
+# true and assumed velocities of figures 10 and 11
 TRUE_M_S, GUESSES_M_S = 10.0, (5.0, 8.0, 10.0)
 Closing = tuple[dict[str, Signal], Tensor]
-# level (dB) below which the text says that false targets are
+# level (dB) below which the false targets are, according to the text
 PUBLISHED_MFTA = {"band-limited": -60.0, "pattern": -25.0}
 
 
-# reconstruction of the bands, and whether the velocity of the target is used, or zero in its place
+# reconstruction of the bands, and True if it uses the velocity of the target, False if zero in its
+# place
 METHODS: dict[str, tuple[Rebuild, bool]] = {
     "conventional, N = 3": (LeastSquares(3), False),
     "conventional, N = 2": (LeastSquares(2), False),
@@ -55,7 +56,7 @@ METHODS: dict[str, tuple[Rebuild, bool]] = {
 
 
 def _simulated(u_r_m_s: Tensor, gate: Gate, seconds: float) -> Signal:
-    """Channels (trial, channel, pulse) of one target a trial."""
+    """Simulate channels (trial, channel, pulse) of one target per trial."""
     at_rest = torch.zeros(len(u_r_m_s), 1, dtype=torch.float64)
     world = BistaticWorld(MovingPoints(u_r_m_s[:, None], at_rest, at_rest, at_rest), gate)
     draws = Draws(1, trials=range(len(u_r_m_s)))
@@ -64,12 +65,13 @@ def _simulated(u_r_m_s: Tensor, gate: Gate, seconds: float) -> Signal:
 
 def _spectrum(data: Signal, rebuild: Rebuild, u_r_m_s: Tensor | float) -> Signal:
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what a poor condition does is the subject of this script
+        # the effects of a poor condition are the subject of this module
+        warnings.simplefilter("ignore")
         return Reconstruct(RADAR, rebuild)(data, u_r_m_s)
 
 
 def _replicas_db(data: Signal, u_r_m_s: Tensor, rebuild: Rebuild, moving: bool, gate: Gate) -> Tensor:
-    """MFTA within three pulse rates, (trial,)."""
+    """Level of the largest false target (MFTA) within three pulse rates, (trial,)."""
     assumed = u_r_m_s if moving else torch.zeros_like(u_r_m_s)
     image = FocusAzimuth(RADAR, bandwidth_hz=BANDWIDTH_HZ)(_spectrum(data, rebuild, assumed), assumed)
     seen = INTEGRATION_S if isinstance(gate, BandLimited) else None
@@ -80,8 +82,10 @@ def _replicas_db(data: Signal, u_r_m_s: Tensor, rebuild: Rebuild, moving: bool, 
 
 
 def _draw_spectra(signal: Signal, path: Path) -> None:
-    """Spectra of a target of 10 m/s rebuilt with guesses of its velocity, over Doppler from zero;
-    dashed: the processed band about the guess.
+    """Draw spectra of a target of 10 m/s that are reconstructed with assumed velocities, over
+    Doppler from zero.
+
+    Dashed lines mark the processed band around the assumed velocity.
     """
     parts = []
     for guess in GUESSES_M_S:
@@ -115,7 +119,7 @@ def _ratios_db(found: Intensity) -> dict[str, Tensor]:
 
 
 def _closing(small: bool) -> Closing:
-    """Channels of the target of figures 10 to 12 by gate, and the velocities of figure 12."""
+    """Channels of the target of figures 10 to 12 for each gate, and the velocities of figure 12."""
     moving = torch.tensor([TRUE_M_S], dtype=torch.float64)
     seconds = {"band-limited": 8.0, "pattern": RECORD_S}
     data = {name: _simulated(moving, gate, seconds[name]) for name, gate in GATES.items()}
@@ -123,7 +127,7 @@ def _closing(small: bool) -> Closing:
 
 
 def _rebuilt(gate: str) -> Callable[[Closing, Path], list[Check]]:
-    """Figure 10 or 11: the share of the power about the centroid by the velocity."""
+    """Make figure 10 or 11: the share of the power near the centroid for each assumed velocity."""
 
     def make(seen: Closing, path: Path) -> list[Check]:
         _draw_spectra(seen[0][gate], path)
@@ -181,7 +185,7 @@ def _figure_17(seen: tuple[Tensor, dict[str, dict[str, Tensor]]], path: Path) ->
         "band-limited": ("proposed, N = 3", "proposed, N = 2"),
         "pattern": ("proposed, N = 3", "proposed, MMSE, N = 5"),
     }
-    table_4_db = -47.56  # the largest there, by the method with three bands
+    table_4_db = -47.56  # largest level in Table 4, by the method with three bands
     checks = []
     for gate, methods in shown.items():
         for method in methods:

@@ -7,8 +7,8 @@ from pathlib import Path
 from torchsar.radar import BistaticRadar, LinearFM, Orbit
 from torchsar.reproduce.item import Check, Item, parameters
 
-# of Table 1; pulse length and sampling are chosen, and 3e8 m/s is the speed behind the printed
-# numbers
+# values of Table 1; pulse length and sampling are chosen, and the printed numbers follow from a
+# speed of 3e8 m/s
 RADAR = BistaticRadar(
     1.25e9,
     LinearFM(50e6, 10e-6),
@@ -18,10 +18,10 @@ RADAR = BistaticRadar(
     reference_range_m=5000.0,
     wave_speed_m_s=3e8,
 )
-# integration time, its Doppler bandwidth, height of the satellite, off-nadir angle
+# integration time, Doppler bandwidth of this time, height of the satellite, off-nadir angle
 INTEGRATION_S, BANDWIDTH_HZ, HEIGHT_M, OFF_NADIR_DEG = 4.5, 337.5, 36_500e3, 7.0
 ORBIT = Orbit.at_height(HEIGHT_M, inclination_deg=60.0, raan_deg=195.5, argument_of_perigee_deg=270.0)
-# chosen: Taylor coefficients (m/s, m/s2, m/s3) of the transmit range of an orbit with this height
+# Taylor coefficients (m/s, m/s2, m/s3) of the transmit range for an orbit of this height, by choice
 TRANSMIT_RANGE = (-243.0, 0.02, 5e-7)
 
 

@@ -40,11 +40,11 @@ from torchsar.reproduce.item import Check, Fact, Item, Made, number, statement
 from torchsar.scene import BandLimited, BistaticWorld, MovingPoints
 from torchsar.study.trials.cuts import finer
 
-# with the range to the satellite in the echo
+# radar whose echo contains the range to the satellite
 RADAR = replace(SENSOR, transmit_range=TRANSMIT_RANGE)
 # (u_r, u_a) of the targets (m/s)
 SPEEDS = {"at rest": (0.0, 0.0), "P1": (0.0, 10.0), "P2": (10.0, 0.0), "P3": (10.0, 5.0), "P4": (5.0, 10.0)}
-# azimuth and receive range (m) in figure 16, which prints none
+# azimuth and receive range (m), which figure 16 does not print
 POSITIONS = {
     "P1": (-300.0, 60.0),
     "P2": (-150.0, -60.0),
@@ -60,14 +60,14 @@ FIGURES = (
     "ISLR in range (dB)",
     "largest false target (dB)",
 )
-# tolerances of the proposed and of the conventional method, whose recipe is not published; of its
-# blurred peaks, a third of the width
+# Tolerances of the proposed method, and of the conventional one, whose details are not published.
+# Its blurred peaks have a tolerance of a third of the width.
 WITHIN = {
     "proposed": (0.02, 0.15, 0.3, 0.05, 0.3, 0.4, 1.0),
     "conventional": (None, 3.0, 3.0, 0.05, 0.3, 0.4, 3.0),
 }
 BLURRED = 1 / 3
-# Table 4, in the order of FIGURES
+# published values of Table 4, in the order of FIGURES
 PUBLISHED = {
     "conventional": {
         "P1": (59.55, -26.30, -26.37, 2.64, -13.01, -9.77, -44.43),
@@ -85,7 +85,7 @@ PUBLISHED = {
 
 
 class _Batch(NamedTuple):
-    """Targets, one a trial, and their channels. speeds: name -> (u_r, u_a)."""
+    """Targets, one per trial, and their channels. speeds: name -> (u_r, u_a)."""
 
     speeds: Mapping[str, tuple[float, float]]
     channels: Signal
@@ -98,8 +98,10 @@ class _Batch(NamedTuple):
 
 
 class _Product(NamedTuple):
-    """Rebuilt spectrum (doppler, range) and image (azimuth, range) of every trial, and how they
-    were made. moving: with the velocities of the targets.
+    """Reconstructed spectrum (doppler, range) and image (azimuth, range) of every trial, and the
+    settings used.
+
+    moving: True if the velocities of the targets were used.
     """
 
     spectrum: Signal
@@ -112,7 +114,9 @@ Seen = tuple[_Batch, dict[str, list[_Product]]]
 
 
 def _received(world: BistaticWorld, n_pulse: int, n_range: int, trials: int | None = None) -> Signal:
-    """Range-compressed channels (channel, pulse, range) without the transmit range."""
+    """Simulate range-compressed channels (channel, pulse, range), with the transmit range
+    removed.
+    """
     recording, _ = simulate_bistatic(
         RADAR, world, n_pulse, n_range, Draws(1, trials=None if trials is None else range(trials))
     )
@@ -120,7 +124,7 @@ def _received(world: BistaticWorld, n_pulse: int, n_range: int, trials: int | No
 
 
 def _simulated(speeds: Mapping[str, tuple[float, float]], n_pulse: int, n_range: int) -> _Batch:
-    """One target at the middle of the scene in each trial, without noise."""
+    """Simulate one target in the middle of the scene in each trial, without noise."""
     u_r, u_a = torch.tensor(list(speeds.values()), dtype=torch.float64).T[..., None]
     world = BistaticWorld(
         MovingPoints(u_r, u_a, torch.zeros_like(u_r), torch.zeros_like(u_r)), BandLimited(INTEGRATION_S)
@@ -129,8 +133,8 @@ def _simulated(speeds: Mapping[str, tuple[float, float]], n_pulse: int, n_range:
 
 
 def _products(batch: _Batch, method: str) -> list[_Product]:
-    """With two and three bands, "conventional" (as if at rest) or "proposed" (with the
-    velocities).
+    """Images with two and with three bands by a method: "conventional" (as if at rest) or
+    "proposed" (with the velocities).
     """
     values = batch.values if method == "proposed" else {}
     standing = CorrectMigration(RADAR, Keystone(whole_swath=False))(batch.channels, **values)
@@ -140,10 +144,10 @@ def _products(batch: _Batch, method: str) -> list[_Product]:
 def _product(
     standing: Signal, bands: int, values: Mapping[str, Tensor | float], range_m: float | None = None
 ) -> _Product:
-    """From channels without migration.
+    """Reconstruct and focus channels whose migration was corrected.
 
-    One filter serves all lines, that of the target: side lobes along range have its history, not
-    that of their line.
+    One azimuth filter, that of the target, is used for all range lines, because side lobes along
+    range have the history of the target and not that of their line.
     """
     with warnings.catch_warnings():
         warnings.simplefilter(
@@ -163,9 +167,10 @@ def _brightest(image: Signal) -> Tensor:
 
 
 def _measured(batch: _Batch, made: _Product) -> Tensor:
-    """Numbers named by FIGURES, (trial, figure)."""
+    """Measure the numbers that FIGURES names, (trial, figure)."""
     profile, step = _brightest(made.image), made.image.axis("azimuth").step
-    across_peak = take(made.image.data, made.image.data.abs().amax(-1).argmax(-1), -2)  # (trial, range)
+    # shape (trial, range)
+    across_peak = take(made.image.data, made.image.data.abs().amax(-1).argmax(-1), -2)
     own, across = (
         azimuth_response(profile, step),
         azimuth_response(across_peak, made.image.axis("range").step / 2),
@@ -186,8 +191,8 @@ def _measured(batch: _Batch, made: _Product) -> Tensor:
 
 
 def _near(image: Signal, along_m: float, range_m: float, trial: int) -> Signal:
-    """Surroundings of the peak of one trial, azimuth and range counted from it, range on the axis c
-    tau / 2.
+    """Part of the image of one trial around its peak. Azimuth and range are relative to the peak,
+    range on the axis c tau / 2.
     """
     azimuth, range_ = image.axes
     data = image.data[trial]
@@ -204,7 +209,7 @@ def _near(image: Signal, along_m: float, range_m: float, trial: int) -> Signal:
 
 
 def _finer(image: Signal, factor: int = 8) -> Signal:
-    """Interpolated by zeros around its spectrum, for contours."""
+    """Interpolate an image for contours, by zeros around its spectrum."""
     data, axes = image.data, []
     for dim, axis in enumerate(image.axes):
         data = factor * finer(data.movedim(dim, -1), factor).movedim(-1, dim)
@@ -213,7 +218,9 @@ def _finer(image: Signal, factor: int = 8) -> Signal:
 
 
 def _spectrum_2d(made: _Product, trial: int) -> Signal:
-    """Rebuilt spectrum of one trial over Doppler (against the centre) and range frequency."""
+    """Reconstructed spectrum of one trial over Doppler (relative to the centre) and range
+    frequency.
+    """
     doppler, range_ = made.spectrum.axes
     data = torch.fft.fftshift(torch.fft.fft(made.spectrum.data[trial]), dim=-1)
     step = RADAR.sampling_hz / range_.n / 1e6
@@ -221,7 +228,9 @@ def _spectrum_2d(made: _Product, trial: int) -> Signal:
 
 
 def _draw_target(made: _Product, trial: int, title: str, path: Path, reach_m: float) -> None:
-    """Spectrum, image to reach_m along azimuth, and azimuth profile of a target."""
+    """Draw the spectrum, the image within reach_m along azimuth, and the azimuth profile of a
+    target.
+    """
     profile, azimuth = _brightest(made.image)[trial], made.image.axis("azimuth")
     curve = (plot.array(azimuth.values()), plot.decibel(profile))
     parts = [
@@ -239,7 +248,7 @@ def _draw_target(made: _Product, trial: int, title: str, path: Path, reach_m: fl
 
 
 def _scene(small: bool) -> Signal:
-    """Four targets in one scene, (channel, pulse, range)."""
+    """Simulate four targets in one scene, (channel, pulse, range)."""
     azimuth, range_ = zip(*POSITIONS.values(), strict=True)
     u_r, u_a = zip(*(SPEEDS[name] for name in POSITIONS), strict=True)
     world = BistaticWorld(MovingPoints(u_r, u_a, azimuth, range_), BandLimited(INTEGRATION_S))
@@ -248,7 +257,7 @@ def _scene(small: bool) -> Signal:
 
 def _figure_16(data: Signal, path: Path) -> list[Check]:
     at_rest = FocusAzimuth(RADAR, bandwidth_hz=BANDWIDTH_HZ)(Reconstruct(RADAR)(CorrectMigration(RADAR)(data)))
-    # range from the reference on the axis c tau / 2, azimuth horizontal
+    # range is relative to the reference and on the axis c tau / 2; azimuth is horizontal
     azimuth, range_ = at_rest.axes
     start_m, step_m = (range_.start - RADAR.reference_range_m) / 2, range_.step / 2
     whole = Signal(at_rest.data.mT, (Axis("range", range_.n, start_m, step_m, "m"), azimuth))
@@ -267,7 +276,9 @@ def _figure_16(data: Signal, path: Path) -> list[Check]:
 
 
 def _own_image(data: Signal, name: str) -> Signal:
-    """A target of the scene, found where it appears, focused with its velocities and position."""
+    """Image of a target of the scene, cut out where it appears and focused with its velocities and
+    position.
+    """
     (u_r, u_a), (y0, beyond) = SPEEDS[name], POSITIONS[name]
     values, range_m = {"u_r_m_s": u_r, "u_a_m_s": u_a, "y0_m": y0}, RADAR.reference_range_m + beyond
     standing = CorrectMigration(RADAR, Keystone(whole_swath=False), range_m=range_m)(data, **values)
@@ -278,18 +289,22 @@ def _own_image(data: Signal, name: str) -> Signal:
 
 
 def _size(small: bool) -> tuple[int, int]:
-    """Pulses and range samples; the reduced form has one replica to either side."""
+    """Numbers of pulses and of range samples. In the reduced form there is one replica on either
+    side.
+    """
     return (1080, 48) if small else (1800, 96)
 
 
 def _targets(small: bool) -> Seen:
-    """Targets and their products by method, with two and with three bands."""
+    """Targets and their images by method, with two and with three bands."""
     batch = _simulated(SPEEDS, *_size(small))
     return batch, {method: _products(batch, method) for method in PUBLISHED}
 
 
 def _figure(name: str, method: str) -> Callable[[Seen, Path], list[Check]]:
-    """The picture of one target by one method, and its width, PSLR and false targets in words."""
+    """Make the figure of one target by one method, and describe its width, PSLR and false
+    targets.
+    """
 
     def make(seen: Seen, path: Path) -> list[Check]:
         trial, (u_r, u_a) = list(SPEEDS).index(name), SPEEDS[name]
@@ -311,7 +326,9 @@ def _figure(name: str, method: str) -> Callable[[Seen, Path], list[Check]]:
 
 
 def _table_4(seen: Seen, path: Path) -> Made:
-    """With two bands, which B_a < 2 PRF needs, and the false targets with three, as published."""
+    """Make Table 4 with two bands, which are needed because B_a < 2 PRF, and the false targets with
+    three bands, as published.
+    """
     checks = []
     for method, rows in PUBLISHED.items():
         two, three = (_measured(seen[0], made) for made in seen[1][method])

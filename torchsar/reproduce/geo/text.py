@@ -13,8 +13,8 @@ from torchsar.reproduce.geo.sensor import BANDWIDTH_HZ, INTEGRATION_S, OFF_NADIR
 from torchsar.reproduce.geo.velocity import TABLE_3, TRUE_M_S, Columns, over_noise
 from torchsar.reproduce.item import Check, Item, given, misprint, number, statement
 
-# largest second coefficient of the transmit range in the text (m/s2), and distances of the ships
-# from the receiver (m) with their along-track speeds (m/s)
+# PRINTED_K2: largest second coefficient of the transmit range in the text (m/s2).
+# SHIPS: distance from the receiver (m) and along-track speed (m/s) of each ship.
 PRINTED_K2 = 0.03
 SHIPS = {"ship 2": (6490.0, 0.0, 934.58, 216.3), "ship 3": (4860.0, 10.0, 723.99, 167.6)}
 

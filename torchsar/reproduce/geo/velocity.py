@@ -34,10 +34,10 @@ from torchsar.scene import BandLimited, BistaticWorld, MovingPoints
 # length of a record (s)
 RECORD_S = 5.0
 GAIN_DB = 10 * math.log10(RADAR.pulse.bandwidth_hz * 10e-6)
-# columns and published errors of Tables 2 and 3
+# columns, and published errors, of Tables 2 and 3
 SCNR_DB = (-50.0, -40.0, -30.0, -20.0, -10.0, 0.0, 10.0)
-TRUE_M_S = 10.0  # of Table 2
-TABLE_2 = {  # |error| (m/s) at SCNR_DB, a single trial each
+TRUE_M_S = 10.0  # true speed of Table 2
+TABLE_2 = {  # error magnitude (m/s) at each SCNR_DB, from a single trial each
     170.0: (4.93, 3.37, 2.39, 0.85, 0.42, 0.33, 0.23),
     180.0: (4.95, 4.32, 1.33, 0.59, 0.19, 0.12, 0.12),
     190.0: (5.68, 4.73, 1.99, 0.73, 0.12, 0.11, 0.04),
@@ -53,22 +53,26 @@ TABLE_3 = {
     7.0: 0.11,
     10.0: 0.17,
     13.0: 0.14,
-}  # u_r -> |error| (m/s) at -10 dB
+}  # speed u_r -> error magnitude (m/s) at -10 dB
 MEAN_OF_DEVIATION = math.sqrt(2 / math.pi)
-# standard deviation of the |error| of a Gaussian over its mean: how far that of one trial is off
+# standard deviation of |error| for a Gaussian error, divided by its mean; a single trial is off by
+# about this share
 SPREAD = math.sqrt(math.pi / 2 - 1)
-# |error| (trial,) by estimator for every column of a table, and what the columns differ in
+# error magnitudes (trial,) by estimator for every column of a table, and the value in which the
+# columns differ
 Columns = tuple[dict[str, list[dict[str, Tensor]]], list[float]]
 
 
 def _simulated(radar: BistaticRadar, u_r_m_s: float, snr_db: float, draws: Draws, n_range: int | None = None) -> Signal:
-    """Channels (trial, channel, pulse[, range]) of a target; snr_db: after range compression."""
+    """Simulate channels (trial, channel, pulse[, range]) of a target. snr_db: SNR after range
+    compression.
+    """
     world = BistaticWorld(MovingPoints([u_r_m_s], [0.0], [0.0], [0.0]), BandLimited(INTEGRATION_S), snr_db=snr_db)
     return simulate_bistatic(radar, world, round(RECORD_S * radar.prf_hz), n_range, draws)[0].signal
 
 
 def _mean_bound(radar: BistaticRadar, u_r_m_s: float, scnr_db: float, known: bool) -> float:
-    """Least mean |error| of u_r (m/s), u_a known a priori or not."""
+    """Lower bound of the mean error magnitude of u_r (m/s), with u_a known a priori or not."""
     unknown = ("u_r_m_s", "y0_m") if known else ("u_r_m_s", "u_a_m_s", "y0_m")
     snr = 10 ** ((scnr_db + GAIN_DB) / 10)
     return MEAN_OF_DEVIATION * float(
@@ -79,7 +83,9 @@ def _mean_bound(radar: BistaticRadar, u_r_m_s: float, scnr_db: float, known: boo
 
 
 def _errors(radar: BistaticRadar, u_r_m_s: float, scnr_db: float, draws: Draws, table: int) -> dict[str, Tensor]:
-    """|error| (trial,) by estimator; the recommended one at the pulse rate of Table 1 only."""
+    """Error magnitudes (trial,) by estimator. The recommended one is used at the pulse rate of
+    Table 1 only.
+    """
     signal = _simulated(radar, u_r_m_s, scnr_db + GAIN_DB, draws)
     between = (4.0, 16.0) if table == 2 else None
     stages: dict[str, Stage] = {"SIR": SignalIntensityRatio(radar, BANDWIDTH_HZ, search_m_s=between)}
@@ -90,7 +96,8 @@ def _errors(radar: BistaticRadar, u_r_m_s: float, scnr_db: float, draws: Draws, 
     if radar.prf_hz == RADAR.prf_hz:
         stages["recommended"] = MovingPointVelocity(radar, Dwell(INTEGRATION_S), search=reach)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of the poor condition of three bands, which SIR needs
+        # the warning is about the poor condition of three bands, which SIR needs
+        warnings.simplefilter("ignore")
         return {
             name: (stage(signal)["u_r_m_s"] - u_r_m_s).abs()
             for name, stage in stages.items()
@@ -105,7 +112,7 @@ def _part(
     bounds: Mapping[str, Sequence[float]],
     published: Sequence[float],
 ) -> dict:
-    """A panel: means with 95 % intervals."""
+    """Make a panel of means with 95 % intervals."""
     series = {}
     for name in columns[0]:
         mean, half = (
@@ -118,7 +125,7 @@ def _part(
 
 
 def _bounds_of(radar: BistaticRadar, points: Sequence[tuple[float, float]]) -> dict[str, list[float]]:
-    """At (u_r, SCNR), with u_a known a priori and not."""
+    """Lower bounds at points (u_r, SCNR), with u_a known a priori and not."""
     return {
         name: [_mean_bound(radar, u_r, scnr, known) for u_r, scnr in points]
         for name, known in (("bound, u_a known", True), ("bound, no prior knowledge", False))
@@ -150,13 +157,15 @@ def _draws(small: bool) -> Draws:
 
 
 def _over_velocity(small: bool) -> Columns:
-    """Table 3: raw SCNR -10 dB; in the reduced form one velocity."""
+    """Errors of Table 3 at a raw SCNR of -10 dB. The reduced form has one velocity."""
     draws, at = _draws(small), [1.0] if small else list(TABLE_3)
     return {"": [_errors(RADAR, u_r, -10.0, draws.part(f"{u_r:g} m/s"), 3) for u_r in at]}, at
 
 
 def _compared(what: str, published: float, column: Mapping[str, Tensor]) -> list[Check]:
-    """The paper's and the recommended estimator beside a published |error|, that of one trial."""
+    """Compare the estimator of the paper and the recommended one with a published error magnitude,
+    which is that of one trial.
+    """
     return [
         number(f"{what}, {name}: mean |error| (m/s)", published, column[name].tolist(), SPREAD * published, "lower")
         for name in ("SIR", "recommended")

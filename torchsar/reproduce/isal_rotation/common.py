@@ -1,4 +1,4 @@
-"""What the figures of several targets with non-uniform rotation share."""
+"""Common parts of the figures of several targets with non-uniform rotation."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def known_of(signal: Signal, radar: InverseRadar) -> dict[str, Any]:
 
 
 def focused(signal: Signal, radar: InverseRadar, rotation: Mapping[str, Tensor]) -> Signal:
-    """Form the image on a Doppler axis, with what is known of the rotation taken out.
+    """Form the image on a Doppler axis, with the effects of a given rotation removed.
 
     Args:
         signal: Range-compressed pulses.

@@ -35,25 +35,26 @@ from torchsar.reproduce.item import Check, Fact, Item, Made, falling, number, se
 from torchsar.scene import Points, PolynomialRotation, TurntableWorld
 from torchsar.study.names.registry import rotation_and_phase
 
-# chosen, but for the wavelength
+# wavelength as published; all other values are a choice
 RADAR = ladar(0.015, 50e3)
 CUBES = Points(azimuth_m=[-0.06, -0.03, 0.0, 0.03, 0.06], range_m=[0.09, -0.12, 0.0, 0.06, -0.06], random_phase=True)
-# the rate of the turntable as set, and shape parameters near the published estimates
+# set rate of the turntable, and shape parameters near the published estimates
 RATE_RAD_S = math.radians(10)
 ROTATION = PolynomialRotation(RATE_RAD_S, (6.0, 1100.0))
-# chosen
+# values by choice
 PULSES, CELLS, WALK_RAD, SNR_DB = 1000, 32, 0.15, 10.0
-# estimates of the genetic algorithm in the text (rad/s, 1/s, 1/s2), and the largest difference from
-# the truth of our simulation that is as good as theirs from the setting of the turntable
+# Estimates of the genetic algorithm in the text (rad/s, 1/s, 1/s2), and accepted differences from
+# the truth of this simulation. They are as large as the differences of the published estimates from
+# the settings of the turntable.
 PUBLISHED = {"omega_rad_s": (0.2040, 0.03), "k1_per_s": (6.1372, 0.3), "k2_per_s2": (1091.0, 30.0)}
 Rotation = Mapping[str, Tensor]
-# figures 19a to 19c; the last stands for the recommended alternation
+# methods of figures 19a to 19c; the last one represents the recommended alternation
 SHOWN = ("uniform autofocus", "autofocus + SM", "autofocus + third order")
 
 
 @dataclass(frozen=True)
 class _PhaseWalk:
-    """A random walk of phase, step_rad (rms) a pulse."""
+    """A random walk of the phase with steps of step_rad rms per pulse."""
 
     step_rad: float
 
@@ -62,14 +63,14 @@ class _PhaseWalk:
 
 
 def _published(signal: Signal, generations: int) -> Estimate:
-    """The genetic algorithm in a box of +-20 % about what the turntable was set to."""
+    """Estimate by the genetic algorithm within +-20 % of the settings of the turntable."""
     figure = ImageEntropy.of(signal, RADAR)
     centre = torch.tensor([math.radians(10), 6.0, 1100.0], dtype=torch.float64)
     return entropy_rotation(figure, "genetic", (0.8 * centre, 1.2 * centre), draws=Draws(1), generations=generations)
 
 
 def _results(signal: Signal, truth: Truth, generations: int) -> tuple[dict[str, Signal], dict[str, Rotation]]:
-    """Images on a Doppler axis, and estimates, by what was done."""
+    """Images on a Doppler axis, and estimates, by the name of the method."""
     uniform = signal.with_data(correct_pulse_phase(signal.data, autofocus(signal.data)["phase_rad"]))
     second, genetic = second_order(uniform, RADAR), _published(uniform, generations)
     third = uneven_rotation(uniform.data, yc_m=0.0, **known_of(uniform, RADAR))
@@ -87,19 +88,19 @@ def _results(signal: Signal, truth: Truth, generations: int) -> tuple[dict[str, 
 
 
 def _scaled(image: Signal, rotation: Rotation) -> Signal:
-    """The image in metres by the mean rate of a rotation."""
+    """Scale an image to metres by the mean rate of a rotation."""
     rate = mean_rate(rotation["omega_rad_s"], rotation["warp_k"], PULSES / RADAR.prf_hz)
     return in_metres(image, RADAR, rate)
 
 
 def _close(image: Signal) -> Signal:
-    """The middle of an image, which holds the cubes, over the peak."""
+    """Middle of an image, which contains the cubes, relative to the peak."""
     over_peak = image.with_data(image.data / image.data.abs().max())
     return plot.within(over_peak, {"azimuth": (-0.09, 0.09), "range": (-0.15, 0.15)})
 
 
 def _profile(image: Signal, y_m: float, reach_m: float = 0.006) -> tuple:
-    """Cross range from the peak (m) and amplitude (dB) of the range cell at y_m."""
+    """Cross range relative to the peak (m), and amplitude (dB), of the range cell at y_m."""
     axis = image.axis("azimuth")
     line = image.data[:, int(image.axis("range").index_of(y_m).round())].abs()
     peak, half = int(line.argmax()), round(reach_m / axis.step)
@@ -117,7 +118,9 @@ class _Seen(NamedTuple):
 
 
 def _turntable(small: bool) -> list[_Seen]:
-    """One draw, and a genetic algorithm of two generations, in the reduced form."""
+    """Images and estimates of all draws. The reduced form has one draw, and a genetic algorithm of
+    two generations.
+    """
     return [_one(seed, 2 if small else 30) for seed in seeds_of(small)]
 
 
@@ -156,14 +159,14 @@ def _figure_19(seen: list[_Seen], path: Path) -> Made:
 
 
 def _each(seen: list[_Seen], method: str, name: str) -> list[float]:
-    """A value of the estimate of every draw."""
+    """Value of the estimate in every draw."""
     return [float(one.estimates[method][name]) for one in seen]
 
 
 def _figure_20(seen: list[_Seen], path: Path) -> list[Check]:
-    """Width of the profile of every cube."""
-    # on the true scale; a random phase also shifts images, so that each profile is centred at its
-    # peak; the alternation last, since it lies on the reference
+    """Draw and compare the width of the profile of every cube."""
+    # All profiles have the true scale. A random phase also shifts images, so that each profile is
+    # centred at its peak. The alternation is drawn last, because it coincides with the reference.
     names = ("clean reference", "uniform autofocus", "autofocus + SM", "alternation")
     shown = {name: _scaled(seen[0].images[name], seen[0].true) for name in names}
     parts = []
@@ -184,7 +187,7 @@ def _figure_20(seen: list[_Seen], path: Path) -> list[Check]:
 
 
 def _width_m(seen: _Seen, name: str) -> float:
-    """Mean over the cubes of the cross range in which a profile is above -3 dB."""
+    """Mean over the cubes of the cross range within which a profile is above -3 dB."""
     image, widths = _scaled(seen.images[name], seen.true), []
     for y in CUBES.range_m:
         offset, level = _profile(image, float(y))

@@ -27,14 +27,14 @@ from torchsar.reproduce.isal_rotation.common import known_of, ladar
 from torchsar.reproduce.item import Check, Item, statement
 from torchsar.scene import Points, PolynomialRotation, Satellite, TurntableWorld
 
-# rotation of the text, but for the rate: 10 and 1000 need 20 mrad/s (rad/s, 1/s, 1/s2)
+# rotation of the text except for the rate: 10 and 1000 require 20 mrad/s (rad/s, 1/s, 1/s2)
 OMEGA_RAD_S, WARP_K = 0.02, (10.0, 1000.0)
 TRUE_K = torch.tensor(WARP_K, dtype=torch.float64)
-# places of the points (m)
+# positions of the points (m)
 PLACES_M, RANGE_M = (-12.0, 0.0, 12.0), 12.0
-CELLS_M = (3.4, 6.0, 12.0)  # ranges of the single cells of figure 1
-FINE = 16  # lines of a profile per Doppler cell
-# of a fit of second order to the phase by least squares; least entropy gives 20.05
+CELLS_M = (3.4, 6.0, 12.0)  # ranges of the single range cells of figure 1
+FINE = 16  # number of lines of a profile per Doppler cell
+# coefficient k1 of a second-order fit to the phase by least squares; least entropy gives 20.05
 SECOND_K1 = 20.8
 NAMES = {
     "none": "no compensation",
@@ -43,23 +43,23 @@ NAMES = {
     "azimuth": "order 3, azimuth",
     "full": "order 3, two-dimensional",
 }
-# of the satellite of figure 1
+# SNR of the satellite of figure 1
 SNR_DB = 20.0
 
 
 @dataclass(frozen=True)
 class _Profile:
-    """Cross range (m), and amplitude over that of an ideal point."""
+    """Cross range (m), and amplitude relative to that of an ideal point."""
 
     cross_range_m: Tensor
     amplitude: Tensor
 
     @staticmethod
     def of(line: Tensor, pulse: Axis, wavelength_m: float) -> _Profile:
-        """Of one range cell (line,).
+        """Profile of one range cell (line,).
 
-        Whatever was compensated, the target turned by the same angle in all: the mean rate scales
-        the line.
+        The mean rate scales the line, whatever was compensated, because the angle of rotation is
+        the same.
         """
         doppler = (torch.arange(len(line), dtype=torch.float64) - len(line) // 2) / (FINE * pulse.n * pulse.step)
         return _Profile(
@@ -73,7 +73,7 @@ class _Profile:
 
 
 def _compensated(signal: Signal, radar: InverseRadar) -> dict[str, _Profile]:
-    """The range cell of the points after each compensation."""
+    """Range cell of the points after each compensation."""
     pulse, range_ = signal.axes
     flat = range_phase(signal.data, range_.values(), radar.wavelength_m, radar.prf_hz, OMEGA_RAD_S, TRUE_K)
     cell = int(range_.index_of(RANGE_M).round())
@@ -96,7 +96,7 @@ def _compensated(signal: Signal, radar: InverseRadar) -> dict[str, _Profile]:
 def _draw_profiles(
     profiles: Mapping[str, _Profile], names: Sequence[str], reach_m: Sequence[float], path: Path
 ) -> None:
-    """Profiles of the three points, 0 dB for an ideal point, each within its reach."""
+    """Draw profiles of the three points, each within its reach; 0 dB is an ideal point."""
     parts = []
     for centre, reach in zip(PLACES_M, reach_m, strict=True):
         near = {NAMES[name]: profiles[name].near(centre, reach) for name in names}
@@ -116,8 +116,10 @@ def _draw_profiles(
 def _whole_image(
     yc_m: Tensor, radar: InverseRadar, n_pulse: int, n_range: int, scatterers: int, snr_db: float
 ) -> dict[str, Tensor]:
-    """Estimated over true rate (yc,) of satellites on both sides of the centre, one per deviation,
-    with the deviation ignored and estimated.
+    """Ratio of estimated to true rate (yc,) for satellites on both sides of the centre, one for
+    each deviation.
+
+    The deviation is ignored in one result and estimated in the other.
     """
     target = Satellite(scatterers, half_width_m=6.43 * radar.prf_hz / 500e3)
     world = TurntableWorld(
@@ -131,7 +133,7 @@ def _whole_image(
 
 
 def _points(small: bool) -> dict[str, _Profile]:
-    """The reduced form is the full one."""
+    """Profiles of the three points after each compensation. The reduced form is the same."""
     radar = ladar(4.0, 1e6)
     points = Points(azimuth_m=PLACES_M, range_m=[RANGE_M] * 3)
     world = TurntableWorld(points, rotation=PolynomialRotation(OMEGA_RAD_S, WARP_K))
@@ -139,7 +141,9 @@ def _points(small: bool) -> dict[str, _Profile]:
 
 
 def _shown(names: Sequence[str], reach_m: Sequence[float]) -> Callable[[dict[str, _Profile], Path], list[Check]]:
-    """Figure 2 or 3: peaks of the outer and of the middle point rise with every compensation."""
+    """Make figure 2 or 3, in which the peaks of the outer and of the middle point rise with every
+    compensation.
+    """
 
     def make(profiles: dict[str, _Profile], path: Path) -> list[Check]:
         _draw_profiles(profiles, names, reach_m, path)
@@ -156,8 +160,9 @@ def _shown(names: Sequence[str], reach_m: Sequence[float]) -> Callable[[dict[str
 
 
 def _deviations(small: bool) -> tuple[Tensor, dict[str, Tensor]]:
-    """Range centre deviations (m), and estimated over true rate of a whole image. A tiny satellite
-    and few deviations in the reduced form.
+    """Range centre deviations (m), and ratio of estimated to true rate of a whole image.
+
+    The reduced form has a tiny satellite and few deviations.
     """
     yc = torch.linspace(-3, 3, 2 if small else 6, dtype=torch.float64)
     size = (ladar(0.24, 50e3), 1000, 32, 60) if small else (ladar(0.24, 500e3), 10000, 32, 300)
@@ -166,8 +171,8 @@ def _deviations(small: bool) -> tuple[Tensor, dict[str, Tensor]]:
 
 def _figure_1(seen: tuple[Tensor, dict[str, Tensor]], path: Path) -> list[Check]:
     yc_m, image = seen
-    # in one range cell whose centre deviation is ignored the range term of y must stand for that of
-    # y + yc, Eq. (6); the rate, the acceleration and the jerk change by the same factor
+    # In a single range cell whose centre deviation is ignored, the range term of y replaces that of
+    # y + yc, Eq. (6). The rate, the acceleration and the jerk change by the same factor.
     fine_m = torch.linspace(float(yc_m[0]), float(yc_m[-1]), 61, dtype=torch.float64)
     cell = {f"y = {y:g} m": torch.sqrt((1 + fine_m / y).clamp_min(0)) for y in CELLS_M}
     parts = [
@@ -186,7 +191,7 @@ def _figure_1(seen: tuple[Tensor, dict[str, Tensor]], path: Path) -> list[Check]
     return [statement("deviation", "ignored, it biases the rotation", holds, ours, len(yc_m))]
 
 
-# figures and tables, by their numbers
+# figures and tables by their numbers
 ITEMS = (
     Item("Figure 1", "estimated rotation over the range centre deviation", of=_deviations, make=_figure_1),
     Item(

@@ -40,9 +40,10 @@ from torchsar.scene import PolynomialRotation, Satellite, TurntableWorld
 ROTATION = PolynomialRotation(OMEGA_RAD_S, WARP_K)
 # cross range (m) of the tips, as in Table 4
 TIP_M = 6.43
-# chosen: pulse rate, pulses, cells, cell size, scatterers, chirplets, in the full and reduced forms
+# pulse rate, pulses, cells, cell size, scatterers and chirplets in the full and the reduced form,
+# by choice
 SIZES = {False: (500e3, 10000, 32, 0.24, 300, 16), True: (50e3, 1000, 32, 0.24, 60, 4)}
-# lines per Doppler cell of the images of Newton's method
+# lines per Doppler cell of the images that Newton's method uses
 LINES_PER_CELL = 8.0
 # estimates of the genetic algorithm in the text (rad/s, 1/s, 1/s2), and tolerances
 PUBLISHED = {
@@ -50,12 +51,13 @@ PUBLISHED = {
     "k1_per_s": (10.002, 0.02),
     "k2_per_s2": (999.6835, 2.0),
 }
-# enlarged regions: middle in half widths of the target in cross range, range (m); half their height
-# (m), at which single scatterers can be seen
+# Enlarged regions.
+# REGIONS: middle in cross range in half widths of the target, and range (m).
+# REGION_M: half their height (m), at which single scatterers are visible.
 TIP = "A, tip of a panel"
 REGIONS = {TIP: (-0.98, (-1.6, 1.6)), "B, bus and dish": (0.04, (-3.6, -0.4))}
 REGION_M = 0.15
-# the methods of the paper
+# names of the methods of the paper
 SHOWN = ("no compensation", "chirplets (ACL)", "SM, order 2", "order 3, two-dimensional")
 
 
@@ -69,16 +71,16 @@ class _Imaged:
     half_width_m: float
 
     def whole(self, name: str) -> Signal:
-        """The target in the image of a method, 1.09 times its cross range."""
+        """Target in the image of a method, within 1.09 times its cross range."""
         return _cut(self.shown[name], 0.0, 1.09 * self.half_width_m, (-3.8, 3.8))
 
     def region(self, name: str, which: str) -> Signal:
-        """One of the enlarged regions."""
+        """One of the enlarged regions in the image of a method."""
         middle, range_m = REGIONS[which]
         return _cut(self.shown[name], middle * self.half_width_m, REGION_M, range_m)
 
     def outlines(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """Lines about the enlarged regions."""
+        """Outlines of the enlarged regions."""
         return {
             name: plot.boxes([((near + far) / 2, middle * self.half_width_m)], (far - near) / 2, REGION_M)
             for name, (middle, (near, far)) in REGIONS.items()
@@ -131,7 +133,7 @@ def _cut(image: Signal, middle_m: float, half_m: float, range_m: tuple[float, fl
 
 
 def _figure_4(seen: list[_Imaged], path: Path) -> list[Check]:
-    """Nothing is published to compare it with."""
+    """Draw Figure 4, for which there are no published numbers."""
     x, y, level = (plot.array(seen[0].truth.values[name]) for name in ("cross_range_m", "range_m", "amplitude"))
     title = f"{len(x)} scatterers, with areas as their amplitudes"
     plot.save(plot.scatterers(y, x, abs(level), "range (m)", "cross range (m)", title), path)
@@ -139,7 +141,7 @@ def _figure_4(seen: list[_Imaged], path: Path) -> list[Check]:
 
 
 def _draw(seen: _Imaged, name: str, path: Path) -> None:
-    """An image and two regions of it, in dB of its peak."""
+    """Draw an image and two regions of it, in dB relative to its peak."""
     parts = {name: seen.whole(name)} | {which: seen.region(name, which) for which in REGIONS}
     plot.save(plot.images(parts, 40, percentile=100, lines={name: seen.outlines()}), path, columns=3)
 
@@ -150,7 +152,7 @@ def _figure_5(seen: list[_Imaged], path: Path) -> list[Check]:
 
 
 def _figure_6(seen: list[_Imaged], path: Path) -> list[Check]:
-    """Samples above -30 dB of the peak."""
+    """Compare the numbers of samples above -30 dB relative to the peak."""
     _draw(seen[0], "chirplets (ACL)", path)
     names = ("chirplets (ACL)", "order 3, two-dimensional")
     levels = [[one.shown[name].data.abs() for one in seen] for name in names]
@@ -166,12 +168,14 @@ def _figure_7(seen: list[_Imaged], path: Path) -> list[Check]:
 
 
 def _figure_8(seen: list[_Imaged], path: Path) -> list[Check]:
-    """The recommended estimator, which gets the data alone; and all methods in one picture."""
+    """Draw the image of the recommended estimator, which uses only the data, and all methods in one
+    picture.
+    """
     _draw(seen[0], "order 3, two-dimensional", path)
     first = seen[0]
     shown = {name: first.whole(name) for name in SHOWN} | {f"{name}, A": first.region(name, TIP) for name in SHOWN}
     peaks = {name: image.data.abs().max() for name, image in shown.items()}
-    # each in dB of the peak of its whole image
+    # each image in dB relative to the peak of its whole image
     shown = {name: image.with_data(image.data / peaks[name.removesuffix(", A")]) for name, image in shown.items()}
     lines = {name: {TIP: first.outlines()[TIP]} for name in SHOWN}
     plot.save(plot.images(shown, 40, percentile=100, lines=lines), path.with_stem(f"{path.stem}_methods"))
@@ -185,7 +189,7 @@ def _figure_8(seen: list[_Imaged], path: Path) -> list[Check]:
 
 
 def _figure_9(seen: list[_Imaged], path: Path) -> list[Check]:
-    """Both tips are enlarged, with the true position of the brightest scatterer of each."""
+    """Draw both tips enlarged, with the true position of the brightest scatterer of each."""
     tips, best = _tips(seen[0]), seen[0].shown["order 3, two-dimensional"]
     shown, lines = {"scaled to metres": seen[0].whole("order 3, two-dimensional")}, {}
     for true_m, range_m, _ in tips:
@@ -214,17 +218,20 @@ def _tips(one: _Imaged) -> list[tuple[float, float, float]]:
 # rate, k1 and k2 of the text (rad/s, 1/s, 1/s2)
 TRUTH = torch.tensor([0.02, 10.0, 1000.0], dtype=torch.float64)
 NAMES = ("omega_rad_s", "k1_per_s", "k2_per_s2")
-# starts over the truth, and largest relative error of an estimate that is close to it
+# BEGINNINGS: starting values relative to the truth.
+# CLOSE: largest relative error of an estimate that counts as close to the truth.
 BEGINNINGS = {0.9: "from 0.9 times the truth", 1.0: "from the truth", 1.1: "from 1.1 times the truth"}
 FACTORS, CLOSE = tuple(BEGINNINGS), 0.05
-# enlarged part of a picture over its largest Doppler
+# enlarged part of a picture, relative to its largest Doppler
 PART = (0.35, 0.45)
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """The first scene, and relative errors of the rate, k1 and k2 of every scene (scene, 3) by
-    start; of None, those of the recommended estimator, which needs none.
+    """The first scene, and relative errors of the rate, k1 and k2 of every scene (scene, 3) for
+    each start.
+
+    The key None stands for the recommended estimator, which needs no start.
     """
 
     signal: Signal
@@ -234,7 +241,9 @@ class _Seen:
 
 
 def _starts(small: bool) -> _Seen:
-    """A tiny satellite, 2 lines per cell and one step in the reduced form."""
+    """Estimates from every start. The reduced form has a tiny satellite, 2 lines per cell and one
+    step.
+    """
     scenes = [simulated(small, seed) for seed in seeds_of(small)]
     found = [{factor: _started(*scene, factor, small) for factor in (*FACTORS, None)} for scene in scenes]
     error = {
@@ -246,7 +255,9 @@ def _starts(small: bool) -> _Seen:
 
 
 def _started(signal: Signal, truth: Truth, radar: InverseRadar, factor: float | None, small: bool) -> Estimate:
-    """Newton's method from a factor times the truth, or the recommended estimator."""
+    """Estimate by Newton's method from a factor times the truth, or by the recommended
+    estimator.
+    """
     if factor is None:
         return uneven_rotation(signal.data, **known_of(signal, radar))
     figure = ImageEntropy.of(signal, radar, EntropyObjective(oversampling=2.0 if small else LINES_PER_CELL))
@@ -255,14 +266,16 @@ def _started(signal: Signal, truth: Truth, radar: InverseRadar, factor: float | 
 
 
 def _compensated(seen: _Seen, factor: float | None) -> Signal:
-    """Image in Doppler, since a wrong rate gives a wrong scale."""
+    """Image on a Doppler axis, because a wrong rate would give a wrong scale in metres."""
     image = focused(seen.signal, seen.radar, seen.first[factor].value)
     doppler, range_ = image.axes
     return Signal(image.data, (Axis("Doppler", doppler.n, 1e-3 * doppler.start, 1e-3 * doppler.step, "kHz"), range_))
 
 
 def _picture(factor: float) -> Callable[[_Seen, Path], list[Check]]:
-    """Figure 10, 11 or 12: the middle of the image, a part of it, and the recommended one."""
+    """Make figure 10, 11 or 12: the middle of the image, a part of it, and the
+    recommended image.
+    """
 
     def make(seen: _Seen, path: Path) -> list[Check]:
         shown, lines = {}, {}
@@ -317,7 +330,7 @@ def _table_1(seen: list[_Imaged], path: Path) -> list[Check]:
     ]
 
 
-# figures and tables, by their numbers
+# figures and tables by their numbers
 ITEMS = (
     Item(
         "Figure 4",

@@ -36,27 +36,27 @@ from torchsar.reproduce.item import Check, Fact, Item, Made, falling, number, se
 from torchsar.scene import PolynomialRotation, Satellite, TurntableWorld
 
 NAMES = {"omega_rad_s": "rate", "k1_per_s": "k1", "k2_per_s2": "k2"}
-# of what a genetic algorithm found
+# name of a result of a genetic algorithm
 GAIN = "entropy below truth (nats)"
 # rotation of the satellite (rad/s, 1/s, 1/s2)
 TRUE = {"omega_rad_s": 0.02, "k1_per_s": 10.0, "k2_per_s2": 1000.0}
-# of figures 14 to 17
+# SNR of figures 14 to 17
 SNR_DB = (-10.0, -5.0, 0.0, 5.0)
-PUBLISHED_TIP = {-10.0: 9.18, 5.0: 1.56}  # Table 4, error of the cross range of the tip (%)
-# the box that the text gives
+PUBLISHED_TIP = {-10.0: 9.18, 5.0: 1.56}  # error of the cross range of the tip in Table 4 (%)
+# search box that the text gives
 LOW, HIGH = [0.9 * value for value in TRUE.values()], [1.1 * value for value in TRUE.values()]
-# scenes at once, of the recommended estimator and of the genetic algorithm
+# scenes in a batch, and numbers of scenes of the recommended estimator and of the genetic algorithm
 BATCH, TRIALS, GENETIC = 25, 100, 50
 
-# errors (trial,) in % by method and SNR, of a genetic algorithm also how much less entropy (nats)
-# its estimate has than the truth; and bounds in % by SNR
+# Errors (trial,) in % by method and SNR, and bounds in % by SNR. For a genetic algorithm also the
+# entropy of the truth minus that of its estimate (nats).
 Errors = tuple[dict[tuple[str, float], dict[str, Tensor]], dict[float, dict[str, Tensor]]]
 Finder = Callable[[Signal, InverseRadar], Estimate]
 
 
 @dataclass(frozen=True)
 class _Target:
-    """A satellite and how its echo is sampled."""
+    """A satellite, and the sampling of its echo."""
 
     prf_hz: float
     n_pulse: int
@@ -95,7 +95,9 @@ def _recommended(signal: Signal, radar: InverseRadar) -> Estimate:
 
 
 def _genetic(oversampling: float, generations: int = 5, population: int = 30) -> Finder:
-    """All trials of a batch at once, each with random numbers of its own."""
+    """Return a genetic algorithm that processes all trials of a batch at once, each with its own
+    random numbers.
+    """
 
     def find(signal: Signal, radar: InverseRadar) -> Estimate:
         figure = ImageEntropy.of(signal, radar, EntropyObjective(oversampling=oversampling))
@@ -126,7 +128,7 @@ def _errors(find: Finder, target: _Target, snr_db: float, seed: int, trials: int
 
 
 def _bounds(target: _Target, snr_db: float, seed: int, trials: int) -> dict[str, Tensor]:
-    """Cramer-Rao bounds in %, root of the mean square over scenes."""
+    """Cramer-Rao bounds in %, as the root mean square over scenes."""
     _, truth = target.simulated(snr_db, seed, range(min(trials, BATCH)))
     positions = (
         truth.values[name]
@@ -141,8 +143,8 @@ def _bounds(target: _Target, snr_db: float, seed: int, trials: int) -> dict[str,
 def _draw_errors(
     found: Mapping[tuple[str, float], Mapping[str, Tensor]], least: Mapping[float, Mapping[str, Tensor]], path: Path
 ) -> None:
-    """Figure 13: estimates over truth with their standard deviations; and rms errors beside the
-    bound.
+    """Draw Figure 13: estimates relative to the truth with their standard deviations, and rms
+    errors beside the bound.
     """
     methods, snr = list(dict.fromkeys(method for method, _ in found)), list(least)
     estimates, rms = [], []
@@ -163,15 +165,17 @@ def _draw_errors(
                 "bounds": {"Cramer-Rao bound": plot.array(torch.stack([least[at][name] for at in snr]))},
             }
         )
-    # each with its own scale: the rate is known far less well than its derivatives
+    # each parameter has its own scale, because the rate is known far less well than its derivatives
     drawn = [figure for part in estimates for figure in plot.error_curves([part], "SNR (dB)", "estimate over truth")]
     plot.save(drawn, path)
     plot.save(plot.error_curves(rms, "SNR (dB)", "rms error (%)", log_y=True), path.with_stem(f"{path.stem}_rms"))
 
 
 def _spread(error: Tensor) -> Tensor:
-    """Of errors in %: mean of the estimate over the truth, and the same less and plus a standard
-    deviation; rms error, and the same less and plus its own standard deviation.
+    """Statistics of errors in %.
+
+    In this order: mean of the estimate relative to the truth, the same minus and plus a standard
+    deviation; rms error, and the same minus and plus its own standard deviation.
     """
     mean, std, rms = error.mean(), error.std(), error.square().mean().sqrt()
     own = rms / math.sqrt(2 * len(error))
@@ -202,7 +206,7 @@ def _small_target(small: bool) -> Errors:
 
 
 def _fall(seen: Errors, method: str) -> list[Check]:
-    """The rms errors at the lowest and at the highest SNR."""
+    """Compare the rms errors at the lowest and at the highest SNR."""
     ends, checks = (SNR_DB[0], SNR_DB[-1]), []
     for name, title in NAMES.items():
         errors = {f"{snr:g} dB": seen[0][method, snr][name] for snr in ends}
@@ -213,7 +217,9 @@ def _fall(seen: Errors, method: str) -> list[Check]:
 
 
 def _below(found: Mapping[str, Tensor]) -> float:
-    """In how many per cent of the scenes a search found less entropy than the truth has."""
+    """Share of the scenes, in per cent, in which a search found less entropy than that of the
+    truth.
+    """
     return 100 * float((found[GAIN] > 0).double().mean())
 
 
@@ -235,8 +241,8 @@ def _table_3(seen: Errors, path: Path) -> Made:
 
 
 class _Tips(NamedTuple):
-    """Images of the first scene (m), entropies (nats) without and with
-    compensation, and |errors| of the rate (%) of every scene.
+    """Images of the first scene (m), entropies (nats) without and with compensation, and error
+    magnitudes of the rate (%) in every scene.
     """
 
     images: dict[float, Signal]
@@ -246,7 +252,9 @@ class _Tips(NamedTuple):
 
 
 def _full_target(small: bool) -> _Tips:
-    """One scene of the tiny target and a generation of six in the reduced form."""
+    """Images and errors of the full satellite. The reduced form has one scene of the tiny target
+    and a population of six.
+    """
     target, scenes, search = (TINY, 1, _genetic(1.0, 1, 6)) if small else (FULL, len(seeds_of(small)), _genetic(1.0))
     tips = _Tips({}, {}, {}, {})
     for snr in SNR_DB:
@@ -264,7 +272,7 @@ def _full_target(small: bool) -> _Tips:
 
 
 def _picture(snr_db: float) -> Callable[[_Tips, Path], list[Check]]:
-    """One of the figures 14 to 17."""
+    """Make one of the figures 14 to 17."""
 
     def make(tips: _Tips, path: Path) -> list[Check]:
         plot.save(plot.image(tips.images[snr_db], 40, f"SNR {snr_db:g} dB", percentile=100), path)
@@ -275,8 +283,11 @@ def _picture(snr_db: float) -> Callable[[_Tips, Path], list[Check]]:
 
 
 def _table_4(tips: _Tips, path: Path) -> Made:
-    """The error of the cross range of the tip is that of the rate; mean |error| over scenes."""
-    low, high, guess = SNR_DB[0], SNR_DB[-1], 5.0  # mean |error| of random guesses in the box
+    """Compare the mean error magnitude over scenes of the cross range of the tip, which is that of
+    the rate.
+    """
+    # mean error magnitude of random guesses in the box
+    low, high, guess = SNR_DB[0], SNR_DB[-1], 5.0
     mean = sum(tips.genetic[high]) / len(tips.genetic[high])
     return [
         *(
@@ -294,7 +305,7 @@ STOPPED = (
     "a search of 170 images, as many as the published run time allows, ends beside the truth: in {below:.0f} % of the "
     "scenes at 5 dB its estimate has less entropy than the truth"
 )
-# figures and tables, by their numbers
+# figures and tables by their numbers
 ITEMS = (
     Item("Figure 13", "estimates of the rotation over SNR", _small_target, _figure_13, STOPPED),
     *(

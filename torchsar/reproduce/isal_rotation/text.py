@@ -22,8 +22,10 @@ POINTS, STEPS = 5 * 21 * 201, (0.001, 0.1, 1.0)
 
 
 class _Seen(NamedTuple):
-    """Values of least entropy on the grid of every scene (scene, 3), how much less entropy (nats)
-    they have than the truth, and processor times (s).
+    """Results of the grid search.
+
+    They are the grid values of least entropy in every scene (scene, 3), the entropy of the truth
+    minus theirs (nats), and processor times (s).
     """
 
     best: torch.Tensor
@@ -33,7 +35,9 @@ class _Seen(NamedTuple):
 
 
 def _searched(small: bool) -> _Seen:
-    """The search on its nodes next to the truth; times with 2 lines per cell on the first scene."""
+    """Search the nodes of the grid next to the truth. Times are measured with 2 lines per cell on
+    the first scene.
+    """
     offsets = torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64)] * 3)
     grid = TRUTH + offsets * torch.tensor(STEPS, dtype=torch.float64)
     scenes = [simulated(small, seed) for seed in seeds_of(small)]

@@ -46,11 +46,12 @@ from torchsar.scene import (
 from torchsar.study.systems.sal.figures import in_milliseconds
 from torchsar.study.systems.sal.judge import Course, course_of, finer_in_range
 
-# of Table 4; the sampling is that of the text, the speed follows from azimuth cells of 0.1 mm
+# values of Table 4; the sampling is that of the text, and the speed follows from azimuth cells of
+# 0.1 mm
 RADAR = TriangularLadar(
     LIGHT_M_S / 1.55e-6, 5e9, 32e-6, 150e6, speed_m_s=3.125, reference_range_m=4339.5, keep_every=4, detection="real"
 )
-# chosen: the paper gives none of what follows
+# values by choice, because the paper gives none of the following
 MOTION = (
     Polynomial((0.08,)),
     Sinusoid(2e-3, 12.0, 22.92),
@@ -66,13 +67,15 @@ TABLE_6 = {
     "segmented": (0.030, -14.00, -13.20, 0.0078, -13.77, -12.78),
 }
 WITHIN = (0.0005, 1.0, ISLR_DB, 0.0005, 1.0, ISLR_DB)
-# in the order of the columns of Table 5
+# methods in the order of the columns of Table 5
 SHOWN = ("uncompensated", "cross-correlation", "segmented")
 
 
 class _Seen(NamedTuple):
-    """The record of the first draw and what every method made of it, and numbers of all draws by
-    method; calm: of the segmented method in still air.
+    """The record of the first draw and the results of every method, and numbers of all draws by
+    method.
+
+    calm: numbers of the segmented method in still air.
     """
 
     recording: Recording
@@ -99,17 +102,20 @@ def _ground(small: bool) -> _Seen:
 def _one(
     small: bool, seed: int, calm: bool = False
 ) -> tuple[Recording, Truth, dict[str, Trace], dict[str, Course], dict[str, dict[str, float]]]:
-    """One draw, calm by the segmented method alone: still air without scintillation, and 20 dB
-    more; every 24th period in the reduced form.
+    """Simulate and process one draw.
+
+    With `calm`, the segmented method alone is used: still air without scintillation, and an SNR
+    higher by 20 dB. The reduced form has every 24th period.
     """
     radar = replace(RADAR, keep_every=24) if small else RADAR
     air = (MOTION[:-1], None, 20.0) if calm else (MOTION, LogAmplitude(0.1), 0.0)
     world = LadarWorld(RetroAndBrokenLine(), *air, fidelity=EverySample())
-    # blocks that hold a period from the trigger on
+    # blocks that contain a period from the trigger on
     how = {"block_s": BLOCK_S, "trigger_s": TRIGGER_S, "trigger_known": True}
     recording, truth = simulate_ladar_record(radar, world, 3840 // radar.keep_every, Draws(seed), **how)
     assert truth.clean is not None
-    period = recording.signal.isel(time=slice(0, 2 * RADAR.sweep_samples))  # which is what a ring needs
+    # a circular shift needs exactly one period
+    period = recording.signal.isel(time=slice(0, 2 * RADAR.sweep_samples))
     given = {"segmented, circular shift": replace(recording, signal=period), "ideal": truth.clean}
     chains = {name: chain for name, chain in _methods(radar).items() if not calm or name == "segmented"}
     traces = {name: chain.trace(given.get(name, recording)) for name, chain in chains.items()}
@@ -123,8 +129,8 @@ def _one(
 def _methods(radar: TriangularLadar) -> dict[str, Chain]:
     """Chains from the record to the image.
 
-    "segmented, circular shift" gets sweeps that the paper's circular shift separated, "ideal" the
-    record without motion.
+    "segmented, circular shift" uses sweeps separated by the circular shift of the paper, "ideal"
+    the record without motion.
     """
     blank = BlankTurningPoints(radar, farthest_m=11.5)
     split = {"split": use(SplitSweeps(radar, "recorded"), trigger_s="aux.trigger_s"), "blank": blank}
@@ -154,8 +160,8 @@ def _methods(radar: TriangularLadar) -> dict[str, Chain]:
 
 
 def _judge(trace: Trace, course: Course) -> dict[str, float]:
-    """Figures of a method: the image, the retro-reflector, and the rms (rad) and the largest error
-    (m) of what is left of the motion.
+    """Metrics of a method: those of the image and of the retro-reflector, and the rms (rad) and the
+    largest error (m) of the remaining motion.
     """
     response = impulse_response(
         trace.signal, (0.0, RETRO_M), sidelobe_nulls=NULLS, search_m=0.15, centre_turns=(None, 0.0)
@@ -288,7 +294,7 @@ def _table_6(seen: _Seen, path: Path) -> Made:
 
 
 def _cut(image: Signal, dim: int, reach_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Offsets (m) from the strongest sample along one axis, and dB of it."""
+    """Offsets (m) from the strongest sample along one axis, and levels in dB relative to it."""
     amplitude = image.data.abs()
     peak = np.unravel_index(int(amplitude.argmax()), amplitude.shape)
     offset = image.axes[dim].step * (np.arange(image.axes[dim].n) - int(peak[dim]))

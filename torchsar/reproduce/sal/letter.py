@@ -22,9 +22,9 @@ from torchsar.scene import LadarWorld, LetterE, QuadraticInSweep
 from torchsar.study.systems.sal.figures import in_milliseconds
 from torchsar.study.systems.sal.judge import course_of, finer_in_range
 
-# relative ranges of the letter (m), and SNR (dB) per sample before compression of one point
+# relative ranges of the letter (m), and SNR (dB) per sample of one point before compression
 SCENE_M, SNR_DB = (-1.5, 1.5), 20.0
-# in the order of the columns of Table 3: entropies fall and contrasts rise along it
+# methods in the order of the columns of Table 3, along which entropies fall and contrasts rise
 SHOWN = ("uncompensated", "cross-correlation", "segmented, summed")
 
 
@@ -33,8 +33,8 @@ Rows = dict[str, list[list[float]]]
 
 
 def _letter(small: bool) -> tuple[Traces, Rows]:
-    """What every method made of the first draw, and by method the entropies (nats), contrasts of
-    the amplitude and residuals (rad) of all draws.
+    """Results of every method for the first draw, and by method the entropies (nats), amplitude
+    contrasts and residuals (rad) of all draws.
     """
     runs = [_run(256 if small else 512, seed) for seed in seeds_of(small)]
     numbers = {name: zip(*(of[name] for _, of in runs), strict=True) for name in runs[0][1]}
@@ -42,13 +42,13 @@ def _letter(small: bool) -> tuple[Traces, Rows]:
 
 
 def _run(n_period: int, seed: int) -> tuple[Traces, dict[str, tuple[float, float, float]]]:
-    """The same of one draw; "ideal" is without motion."""
+    """Results and numbers of one draw. "ideal" is without motion."""
     world = LadarWorld(LetterE(), MOTION, snr_db=SNR_DB, fidelity=QuadraticInSweep())
     recording, truth = simulate_ladar(RADAR, world, n_period, Draws(seed))
     assert truth.clean is not None
     estimators: dict[str, Stage] = {
         "cross-correlation": SpectrumCorrelation(RADAR, upsampling=20),
-        # points 5 cm apart merge in half sweeps, whose cell is 6 cm
+        # points 5 cm apart are not resolved in half sweeps, whose range cell is 6 cm
         "segmented, at one peak": SegmentedInterference(RADAR),
         "segmented, summed": SegmentedInterference(RADAR, bins="sum", unwrap="per_pulse", window_m=SCENE_M),
     }
@@ -94,8 +94,10 @@ def _table_3(seen: tuple[Traces, Rows], path: Path) -> list[Check]:
 
 
 def _about_letter(signal: Signal) -> Signal:
-    """Relative ranges of -0.7 to 0.9 m, with room for the shift of beats by the velocity, and
-    azimuths of an image about the letter.
+    """Part of a signal around the letter.
+
+    It covers relative ranges of -0.7 to 0.9 m, with a margin for the shift of beat frequencies by
+    the velocity, and azimuths around the letter.
     """
     part = signal.sel(range=slice(-0.7, 0.9))
     return part.sel(azimuth=slice(-0.12, 0.12)) if "azimuth" in part.names else part

@@ -30,11 +30,12 @@ from torchsar.scene import LadarWorld, Points, Polynomial, QuadraticInSweep, Sin
 from torchsar.study.systems.sal.judge import Course, course_of, finer_in_range
 from torchsar.study.trials.cuts import impulse_cuts
 
-# of Table 1; the sampling is chosen
+# values of Table 1; the sampling is chosen
 RADAR = TriangularLadar(
     LIGHT_M_S / 1.55e-6, bandwidth_hz=5e9, period_s=16e-6, sample_rate_hz=64e6, speed_m_s=60.0, reference_range_m=3000.0
 )
-# not published: an azimuth aperture of 0.342 m, for the published 6.0 mm; places and motion
+# Values that are not published. BEAM_RAD: an azimuth aperture of 0.342 m, which gives the published
+# width of 6.0 mm. Positions and motion.
 BEAM_RAD = 114e-6
 PLACES_M = ((-0.06, 1.0), (0.0, 1.5), (0.06, 2.0))
 SCENE = Points(*zip(*PLACES_M, strict=True), amplitude=[0.7, 1.0, 0.7])
@@ -43,15 +44,15 @@ MOTION = (
     Sinusoid(160e-6, 100.0, math.degrees(0.3)),
     Sinusoid(10e-6, 330.0, math.degrees(1.0)),
 )  # 0.35 m/s and 20 m/s^2
-# extent of side lobes for the ISLR, which the paper does not give: a sinc has -12.84 dB with two
-# nulls and -11.54 dB with three
+# Extent of side lobes for the ISLR, which the paper does not give. For a sinc it is -12.84 dB with
+# two nulls and -11.54 dB with three.
 NULLS = 2
-# half of this difference (dB)
+# tolerance: half of this difference (dB)
 ISLR_DB = 0.7
-# relative ranges of all points (m), and the methods that compensate
+# relative ranges of all points (m), and names of the methods that compensate the motion
 ALL_M, COMPENSATED = slice(0.7, 2.3), ("segmented", "recommended")
-# what is measured of an impulse response, and its name in words; widths in range are cells c / 2B,
-# 1 / 0.886 of -3 dB widths
+# Measured properties of an impulse response, with their names. Widths in range are cells c / 2B,
+# which are -3 dB widths over 0.886.
 NAMES = {
     "irw_range_m": "width in range (m)",
     "pslr_range_db": "PSLR in range (dB)",
@@ -66,7 +67,7 @@ WITHIN = (0.0005, 0.15, ISLR_DB, 0.0005, 0.15, ISLR_DB)
 
 
 class Seen(NamedTuple):
-    """What every method made of the echoes, the truth, and the image without motion."""
+    """Results of every method, the truth, and the image without motion."""
 
     traces: dict[str, Trace]
     courses: dict[str, Course]
@@ -75,7 +76,7 @@ class Seen(NamedTuple):
 
 
 def _three_points(small: bool) -> Seen:
-    """The reduced form is the full one."""
+    """Simulate and process the three points. The reduced form is the same."""
     world = LadarWorld(SCENE, MOTION, fidelity=QuadraticInSweep())
     recording, truth = simulate_ladar(RADAR, world, 512, Draws(1))
     chains = methods({"segmented": SegmentedInterference(RADAR, hann=True)}, (0.0, 3.0))
@@ -110,14 +111,14 @@ def methods(
 
 
 def _figure_2(small: bool, path: Path) -> list[Check]:
-    """The triangle and its echo, and the dechirped beat at rest and in motion.
+    """Draw the triangular sweep and its echo, and the dechirped beat at rest and in motion.
 
-    50 MHz instead of 5 GHz, so that the delay can be seen.
+    The bandwidth is 50 MHz instead of 5 GHz, so that the delay is visible.
     """
     radar, range_m = replace(RADAR, bandwidth_hz=50e6), 150.0
     time_s = torch.linspace(0, 3 * radar.period_s, 1500, dtype=torch.float64)
     delays, us = (0, 2 * range_m / radar.wave_speed_m_s), plot.array(1e6 * time_s)
-    # the triangle starts at time zero, and counts from the middle of its band
+    # the triangle starts at time zero; frequencies are relative to the middle of its band
     triangles = [0.5 - (2 * torch.remainder((time_s - delay) / radar.period_s, 1) - 1).abs() for delay in delays]
     sent, echo = (1e-6 * (radar.bandwidth_hz * triangle) for triangle in triangles)
     swept = {"local oscillator": (us, plot.array(sent)), "echo of 150 m beyond the reference": (us, plot.array(echo))}
@@ -143,7 +144,7 @@ def _figure_2(small: bool, path: Path) -> list[Check]:
 
 
 def _beat_mhz(spectrum: Signal, at_us: float) -> float:
-    """Strongest frequency at a time."""
+    """Strongest frequency (MHz) at a time."""
     column = spectrum.data[:, int(spectrum.axis("time").index_of(at_us).round())]
     return float(spectrum.axis("frequency").values()[int(column.argmax())])
 
@@ -170,14 +171,16 @@ def draw_over_time(pulse: Axis, drawn: Mapping[str, tuple[str, Mapping[str, Tens
 
 
 def _response(image: Signal, azimuth_m: float = 0.0, range_m: float = 1.5) -> dict[str, float]:
-    """Impulse response of a point, with widths in range as cells."""
+    """Impulse response of a point, with the width in range as a range cell."""
     found = impulse_response(image, (azimuth_m, range_m), sidelobe_nulls=NULLS, search_m=0.2, centre_turns=(None, 0.0))
     values = {name: float(found[name]) for name in NAMES}
     return {**values, "irw_range_m": values["irw_range_m"] / 0.886}
 
 
 def _focus(seen: Seen, method: str, path: Path) -> tuple[float, float]:
-    """Draw range profiles and image; return the migration (cells) and the PSLR in azimuth (dB)."""
+    """Draw range profiles and the image, and return the migration (cells) and the PSLR in azimuth
+    (dB).
+    """
     trace = seen.traces[method]
     profiles, image = (signal.sel(range=ALL_M) for signal in (trace.outputs["compress"], trace.signal))
     named = {f"range profiles, {method}": profiles, f"image, {method}": image}
@@ -242,7 +245,7 @@ def _figure_8(seen: Seen, path: Path) -> list[Check]:
         finer_in_range(finer_in_range(seen.traces[name].signal)).sel(range=ALL_M)
         for name in ("uncompensated", "segmented")
     )
-    # four cells to either side of a point
+    # four cells on either side of a point
     points = {
         f"point at {r:g} m": after.sel(azimuth=slice(x - 0.024, x + 0.024), range=slice(r - 0.12, r + 0.12))
         for x, r in PLACES_M
