@@ -77,6 +77,7 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> None:
     module = ModuleType("dask_jobqueue")
     module.SLURMCluster = SLURMCluster  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "dask_jobqueue", module)
+    monkeypatch.setattr("subprocess.run", lambda words, check: parser().parse_args(words[1:]))
 
 
 @pytest.mark.parametrize("page", with_blocks("python"))

@@ -72,6 +72,8 @@ def parser() -> argparse.ArgumentParser:
     sweep = commands.choices["sweep"]
     for one, what in ((sweep, "sweep"), (commands.choices["focus"], "image")):
         one.add_argument("--resume", action="store_true", help=f"go on with the {what} in the folder, if there is one")
+    text = "go on although the code of torchsar, a file or a key differs; the report names it"
+    sweep.add_argument("--allow-changed", action="store_true", help=text)
     sweep.add_argument("--workers", type=_positive, metavar="N", help="compute in N processes (extra `cluster`)")
     sweep.add_argument("--cluster", metavar="ADDRESS", help="compute on a running dask scheduler, tcp://host:8786")
     for name, text in _EXCHANGE.items():
@@ -155,6 +157,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if wrong is not None:
         return _fail(f"the argument {wrong!r} has characters that are no text; rename the file or folder, or retype it")
     options = _parse(given)
+    # threads that spin while they wait starve those that work; torch reads this when it is imported
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         if options.version:
             from importlib.metadata import version
@@ -261,7 +265,7 @@ def _dispatch(options: argparse.Namespace, command: str) -> int:
                 "one process keeps %s busy only in part; let several share it with --workers 6%s", options.device, drawn
             )
         engine = (options.resume, options.workers, options.cluster, options.threads or 1, options.device)
-        print(sweep(loaded, out, *engine, command))
+        print(sweep(loaded, out, *engine, command, options.allow_changed))
     else:
         from torchsar.study.commands.requires import requires
         from torchsar.study.commands.trade import trade

@@ -20,7 +20,7 @@ import pytest
 import torch
 
 from torchsar.core import Chain, Stage
-from torchsar.study.montecarlo.fingerprint import fingerprint, own_code
+from torchsar.study.montecarlo.fingerprint import code, fingerprint, packages_of
 from torchsar.study.settings.errors import ConfigError
 
 PROGRAM = """
@@ -217,11 +217,17 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         del sys.modules[name]
 
 
+def test_a_package_that_is_not_loaded_counts_as_when_it_is(package: Path) -> None:
+    before = code(["louder_package"])
+    importlib.import_module("louder_package")
+    assert code(["louder_package"]) == before != code(["no_such_package"])
+
+
 def test_the_code_of_own_stages_counts_with_all_of_their_package(package: Path) -> None:
     Louder = importlib.import_module("louder_package").Louder
-    chain = Chain(first=Louder(), second=Stage())
-    was = own_code([chain])
-    assert list(was) == ["louder_package"] and own_code([chain]) == was
-    assert own_code([Chain(second=Stage())]) == {}
+    mine = packages_of([Chain(first=Louder(), second=Stage())])
+    assert mine == {"louder_package"} and not packages_of([Chain(second=Stage())])
+    was = code(mine)
+    assert list(was["code"]) == ["louder_package", "torchsar"] and code(mine) == was
     (package / "gain.py").write_text("GAIN = 3.0\n")
-    assert own_code([chain]) != was
+    assert code(mine)["code"]["louder_package"] != was["code"]["louder_package"] and code() == code(())

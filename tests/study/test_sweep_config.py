@@ -7,7 +7,9 @@ import json
 import logging
 from collections.abc import Callable
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,6 +27,7 @@ from torchsar.study.settings.errors import ConfigError
 from torchsar.study.settings.sections import Loaded
 from torchsar.study.systems.stripmap import error_name
 from torchsar.study.table import load
+from torchsar.study.trials.bench import Bench
 
 SWEEP = {"world.noise.snr_db": [0.0, 20.0], "world.doppler_hz": [-20.0, 30.0], "trials": 6}
 SMALL = ["sweep.world.noise.snr_db=[-10.0, 10.0]", "sweep.world.squint_deg=[0.25]"]
@@ -187,20 +190,36 @@ def test_titles_and_trials_do_not_stop_a_resume() -> None:
     assert identity(config) != identity(config.changed({"world.pulses": 77}))
 
 
-def test_a_sweep_does_not_go_on_with_other_code_of_own_stages(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, load_tree
+@pytest.mark.parametrize("what", ["code", "versions"])
+def test_a_sweep_does_not_go_on_with_other_programs_unless_told_so(
+    what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, load_tree
 ) -> None:
-    """It would mix the results of two stages. A sweep without own stages has no such entry."""
+    """It would mix the results of two versions; a mixed store says so."""
     config = load_tree({**TINY, "sweep": {**SWEEP, "trials": 1}})
     one_picture(monkeypatch)
-    assert identity(config, SweepTrial(config).bench({}).chains.values()) == identity(config)
-    for code in ("one", "another"):
-        monkeypatch.setattr(sweep_module, "own_code", lambda chains, code=code: {"mine": code} if list(chains) else {})
-        if code == "one":
-            sweep_module.sweep(config, tmp_path / "out")
-            sweep_module.sweep(config, tmp_path / "out", resume=True)
-    with pytest.raises(ConfigError, match="code of mine"):
+    sweep_module.sweep(config, tmp_path / "out")
+    sweep_module.sweep(config, tmp_path / "out", resume=True)
+    now = sweep_module.code()
+    changed = {**now, what: {**now[what], "torchsar" if what == "code" else "torch": "other"}}
+    monkeypatch.setattr(sweep_module, "code", lambda packages: changed)
+    with pytest.raises(ConfigError, match=rf"{what}\.torch\w* was .* and is other; .*--allow-changed"):
         sweep_module.sweep(config, tmp_path / "out", resume=True)
+    report = sweep_module.sweep(config.changed({"sweep.trials": 2}), tmp_path / "out", resume=True, allow_changed=True)
+    about = read_sweep(tmp_path / "out").about
+    assert len(about["changed"]) == 1 and what in about["changed"][0] and about["earlier"][0][what] == now[what]
+    assert about["changed"][0].startswith("after ") and "and is other" in report.read_text(encoding="utf-8")
+
+
+def test_contents_of_files_are_part_of_the_identity(tmp_path: Path) -> None:
+    """Another track under the same name is another sweep."""
+    track = tmp_path / "track.csv"
+    track.write_text("0.0\n1.0\n")
+    config = load("path_autofocus")
+    named = replace(config, config=config.config.model_copy(update={"world": {"motion": [{"file": str(track)}]}}))
+    was = identity(named)
+    assert list(was["files"]) == [str(track)] and not identity(config)["files"]
+    track.write_text("0.0\n1.5\n")
+    assert identity(named)["files"] != was["files"]
 
 
 def test_the_source_of_random_numbers_is_part_of_the_identity() -> None:
@@ -262,3 +281,16 @@ def test_the_point_estimator_of_the_stripmap_sweep_stands_on_its_bound(load_tree
     bound = record.bounds["doppler_error_hz"]["Cramer-Rao bound of a point of known position"][0, 0, :, 0]
     assert ((0.7 * bound < rmse) & (rmse < 1.45 * bound)).all()
     assert (rmse < record.bounds["doppler_error_hz"]["1/(T sqrt q), Tsvetkov 2017"][0, 0, :, 0]).all()
+
+
+def test_a_simulation_that_is_too_large_for_memory_is_halved_as_well(
+    monkeypatch: pytest.MonkeyPatch, load_tree: Callable[..., Any]
+) -> None:
+    bench = Bench(load_tree(TINY), "cpu")
+    monkeypatch.setattr(type(bench.system), "simulate", too_large)
+    with pytest.raises(MemoryError, match="full"):
+        bench.trials(bench.draws(trials=[0, 1]))
+
+
+def too_large(*_: object) -> None:
+    raise MemoryError("full")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import random
 import signal
+import threading
 import time
 from collections import Counter
 from pathlib import Path
@@ -18,6 +19,7 @@ from tests.study.tiny import write_tiny
 from torchsar.cli import main
 from torchsar.study.montecarlo import Record, engines, read_sweep
 from torchsar.study.montecarlo.engines import engine
+from torchsar.study.montecarlo.fingerprint import code
 from torchsar.study.output import progress
 from torchsar.study.settings.errors import ConfigError
 
@@ -226,3 +228,60 @@ def test_ctrl_c_with_workers_is_one_sentence(tmp_path: Path) -> None:
     os.killpg(running.pid, signal.SIGINT)  # as a terminal does, to all of them
     assert running.wait() == 130 and "Traceback" not in running.said, running.said
     assert running.said.strip().endswith("go on with --resume") and read_sweep(out).done.any()
+
+
+@needs_dask
+def test_a_worker_with_other_programs_gets_no_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Results of two versions would be mixed; a worker that comes later is asked as well."""
+    from distributed import LocalCluster
+
+    now = code()
+    other = {**now, "code": {"torchsar": "other"}}
+    with LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None, silence_logs=50
+    ) as cluster:
+        monkeypatch.setattr(engines, "code", lambda packages: other)
+        with pytest.raises(ConfigError, match=r"worker \S+ has other programs .*code.torchsar was .* and is other"):
+            toy.run(cluster=cluster.scheduler_address, chunk=7)
+        monkeypatch.setattr(engines, "code", broken)
+        with pytest.raises(ConfigError, match=r"worker \S+ cannot compute trials \(ImportError: none\); install"):
+            toy.run(cluster=cluster.scheduler_address, chunk=7)
+
+
+def broken(packages: object) -> dict:
+    raise ImportError("none")
+
+
+@needs_dask
+def test_workers_are_awaited_and_the_loss_of_a_scheduler_is_one_sentence(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, alone: Record
+) -> None:
+    from distributed import Client, LocalCluster
+
+    def lost(*_: object, **__: object) -> None:
+        raise OSError("stream is closed")
+
+    with LocalCluster(
+        n_workers=0, threads_per_worker=1, processes=False, dashboard_address=None, silence_logs=50
+    ) as cluster:
+        add = threading.Timer(1.0, cluster.scale, args=(1,))
+        add.start()
+        bitwise(toy.run(cluster=cluster.scheduler_address, chunk=7), alone)
+        add.join()
+        assert caplog.text.count("waiting for workers: start them with `dask worker") == 1
+        monkeypatch.setattr(Client, "submit", lost)
+        with pytest.raises(ConfigError, match=r"scheduler of the sweep does not answer .*closed.* go on with --resume"):
+            toy.run(cluster=cluster.scheduler_address, chunk=7)
+
+
+@needs_dask
+def test_the_workers_of_this_machine_take_work_from_nobody_else() -> None:
+    from distributed import Client
+
+    with engine(workers=1) as ours:
+        address = ours.client.scheduler.address
+        assert address.startswith("tls://127.0.0.1")
+        with pytest.raises((OSError, TypeError)):
+            Client(address, timeout=2)
+        with pytest.raises(OSError):
+            Client(address.replace("tls", "tcp"), timeout=2)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchsar.core import Chain, Draws
 from torchsar.study.montecarlo.engines import engine
-from torchsar.study.montecarlo.fingerprint import own_code
+from torchsar.study.montecarlo.fingerprint import code, files_in, packages_of
 from torchsar.study.montecarlo.grid import Grid, make_grid
 from torchsar.study.montecarlo.loop import (
     SWEEP_FILES,
@@ -112,6 +112,7 @@ def sweep(
     threads: int = 1,
     device: str = "cpu",
     command: str = "torchsar sweep",
+    allow_changed: bool = False,
 ) -> Path:
     """Run the sweep of a config, and write its results and report into a folder.
 
@@ -125,6 +126,8 @@ def sweep(
         threads: Number of torch threads in each process.
         device: Device on which batches are computed.
         command: Command line that the report shows.
+        allow_changed: Whether to go on with a sweep of other code, files or keys. The report then
+            names what changed.
 
     Returns:
         The path of the report.
@@ -159,6 +162,7 @@ def sweep(
                 plan,
                 identity(loaded, (one for case in grid.cases() for one in trial.bench(case.fixed).chains.values())),
                 resume,
+                allow_changed,
             )
             store.note(**about)
             record = run_plan(plan, trial, store, engine(workers, cluster, threads))
@@ -224,15 +228,14 @@ def sweep_grid(loaded: Loaded, trial: SweepTrial) -> Grid:
 
 
 def identity(loaded: Loaded, chains: Iterable[Chain] = ()) -> dict[str, Any]:
-    """Return everything besides the grid that changes the results: the seed and the source of
-    random numbers, all other keys of the config that change results, and the code of the user's own
-    stages.
+    """Return what the results depend on besides the grid: the seed and the source of the random
+    numbers, all other keys of the config that change results, the contents of the files that it
+    names, the code of torchsar and of the user's own stages in the chains, and the versions of
+    torch and numpy.
     """
-    return {
-        **identity_of_draws(loaded.config.seed, loaded.config.random),
-        "config": loaded.config.model_dump(exclude=_NOT_IDENTITY),
-        **{f"code of {name}": code for name, code in own_code(chains).items()},
-    }
+    tree = loaded.config.model_dump(exclude=_NOT_IDENTITY)
+    drawn = identity_of_draws(loaded.config.seed, loaded.config.random)
+    return {**drawn, "config": tree, "files": files_in([tree, loaded.config.sweep.grid]), **code(packages_of(chains))}
 
 
 def report(record: Record, loaded: Loaded, out: Path, config_text: str, command: str) -> None:

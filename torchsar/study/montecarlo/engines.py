@@ -6,7 +6,7 @@ import logging
 import signal
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -16,11 +16,14 @@ import torch
 
 from torchsar.io.extras import library
 from torchsar.study.memory import keep_freed_memory
+from torchsar.study.montecarlo.fingerprint import changes, code
 from torchsar.study.montecarlo.work import Chunk, Computed, Work
 from torchsar.study.settings.errors import ConfigError, one_line
 
+log = logging.getLogger("torchsar")
 Task = tuple[Chunk, int | None]
 _QUEUE = 4  # number of chunks submitted ahead per worker, so that no worker is idle
+_POLL_S = 2e-3  # interval at which finished chunks are looked for; a chunk takes 50 ms or more
 _DEATHS = 10  # number of workers that may die with a chunk before the chunk counts as the cause
 
 
@@ -45,7 +48,24 @@ def _compute(chunk: Chunk, fits: int | None) -> Computed:
     from distributed import get_worker
 
     carrier: Any = get_worker().plugins[_PLUGIN]
+    _refuse_others({get_worker().address: carrier.programs}, carrier.work)
     return carrier.work.compute(chunk, fits)
+
+
+def _refuse_others(found: Mapping[str, Any], work: Work) -> None:
+    """Refuse workers by their programs, or by the error that a worker without torchsar gives."""
+    for address, programs in found.items():
+        if isinstance(programs, Exception):
+            raise ConfigError(
+                f"the worker {address} cannot compute trials ({type(programs).__name__}: {one_line(programs)}); "
+                "install torchsar there as it is here"
+            )
+        differing = [*changes(work.programs, programs)]
+        if differing:
+            raise ConfigError(
+                f"the worker {address} has other programs than this process: {', '.join(differing[:3])}; install the "
+                "same versions there, and start its process again"
+            )
 
 
 _PLUGIN = "torchsar-work"
@@ -71,7 +91,7 @@ def _plugin(work: Work, threads: int, own: bool) -> Any:
             keep_freed_memory()
             if own and threading.current_thread() is threading.main_thread():
                 signal.signal(signal.SIGINT, signal.SIG_IGN)
-            self.work = _on_own_gpu(work, worker.name)
+            self.work, self.programs = _on_own_gpu(work, worker.name), code(work.programs["code"])
 
     return Carrier()
 
@@ -89,7 +109,8 @@ class Distributed:
     A chunk whose worker process dies is run again by another worker, until ten have died with it.
 
     Raises:
-        ConfigError: If so many workers died, most likely for want of memory.
+        ConfigError: If so many workers died, most likely for want of memory, if a worker has other
+            programs than this process, or if the scheduler does not answer any more.
     """
 
     client: Any
@@ -98,34 +119,53 @@ class Distributed:
     own: bool = False
 
     def results(self, work: Work, tasks: Iterable[Task]) -> Iterator[tuple[Chunk, Computed]]:
-        from distributed import KilledWorker, as_completed
+        from distributed import CancelledError, KilledWorker, as_completed
 
-        self.client.register_plugin(_plugin(work, self.threads, self.own), name=_PLUGIN)
-        source, waiting, done = iter(tasks), {}, as_completed()
-        asked, workers = time.monotonic(), self.workers
-
-        def submit() -> None:
-            """Fill the queue for the present number of workers; those of a cluster come and go."""
-            nonlocal asked, workers
-            if not self.own and time.monotonic() > asked + 1:
-                asked, workers = time.monotonic(), len(self.client.nthreads())
-            for chunk, fits in islice(source, max(0, _QUEUE * max(1, workers) - len(waiting))):
-                future = self.client.submit(_compute, chunk, fits, pure=False)
-                waiting[future] = chunk
-                done.add(future)
-
+        source, waiting = iter(tasks), {}
         try:
-            submit()
-            for future in done:
+            workers, asked = self._workers(), time.monotonic()
+            _refuse_others(self.client.run(code, list(work.programs["code"]), on_error="return"), work)
+            self.client.register_plugin(_plugin(work, self.threads, self.own), name=_PLUGIN)
+            done = as_completed()
+            while True:
+                # The queue is filled for the present number of workers, which changes in a cluster.
+                for chunk, fits in islice(source, max(0, _QUEUE * workers - len(waiting))):
+                    future = self.client.submit(_compute, chunk, fits, pure=False)
+                    waiting[future] = chunk
+                    done.add(future)
+                if not waiting:
+                    return
+                while not done.has_ready():
+                    time.sleep(_POLL_S)
+                    if time.monotonic() > asked + 1:
+                        workers, asked = self._workers(), time.monotonic()
+                future = next(done)
                 yield waiting.pop(future), future.result()
-                submit()
         except KilledWorker as error:
             raise ConfigError(
                 f"the workers of the sweep died one after the other ({one_line(error)}), most likely because memory "
                 "ran out; use fewer workers, a smaller chunk, or a smaller scene"
             ) from None
+        except (CancelledError, OSError) as error:
+            waiting.clear()
+            raise ConfigError(
+                f"the scheduler of the sweep does not answer any more ({type(error).__name__}: {one_line(error)}); "
+                "finished trials are recorded: start a scheduler, and go on with --resume"
+            ) from None
         finally:
-            self.client.cancel(list(waiting), force=True)
+            if waiting:
+                self.client.cancel(list(waiting), force=True)
+
+    def _workers(self) -> int:
+        """Return the number of workers; without a worker, log one line and wait for the first."""
+        if self.own:
+            return self.workers
+        address = self.client.scheduler.address
+        if not self.client.nthreads():
+            log.warning("waiting for workers: start them with `dask worker %s --nthreads 1`", address)
+            while not self.client.nthreads():
+                time.sleep(0.2)
+        return len(self.client.nthreads())
 
 
 Engine = InProcess | Distributed
@@ -170,10 +210,16 @@ def _local(distributed: Any, workers: int, threads: int) -> Iterator[Engine]:
     settings = {
         "distributed.nanny.pre-spawn-environ": dict.fromkeys(
             ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), threads
-        ),
+        )
+        | {"OMP_WAIT_POLICY": "PASSIVE"},
         "distributed.scheduler.allowed-failures": _DEATHS,
+        # the servers of pages, which dask always starts, have none
+        "distributed.scheduler.http.routes": [],
+        "distributed.worker.http.routes": [],
     }
-    wanted = {"threads_per_worker": 1, "processes": True, "dashboard_address": None, "silence_logs": 50}
+    wanted = {"threads_per_worker": 1, "processes": True, "dashboard_address": "127.0.0.1:0", "silence_logs": 50}
+    # processes of other users cannot give work to the workers
+    wanted |= {"security": True, "scheduler_kwargs": {"dashboard": False}}
     with config.set(settings):
         try:
             cluster = distributed.LocalCluster(n_workers=workers, memory_limit=0, **wanted)
@@ -188,6 +234,8 @@ def _local(distributed: Any, workers: int, threads: int) -> Iterator[Engine]:
 
 @contextmanager
 def _remote(distributed: Any, address: str, threads: int) -> Iterator[Engine]:
+    for part in ("client", "utils"):  # the loss of a scheduler is reported once, as one sentence
+        logging.getLogger(f"distributed.{part}").setLevel(logging.CRITICAL)
     try:
         client = distributed.Client(address, timeout=20)
     except (OSError, ValueError) as error:
@@ -195,5 +243,4 @@ def _remote(distributed: Any, address: str, threads: int) -> Iterator[Engine]:
             f"--cluster {address} does not answer ({one_line(error)}); start a scheduler there, or leave --cluster out"
         ) from None
     with client:
-        client.wait_for_workers(1, timeout=600)
-        yield Distributed(client, len(client.nthreads()), threads)
+        yield Distributed(client, max(1, len(client.nthreads())), threads)

@@ -1,13 +1,16 @@
-"""Fingerprints of functions: digests of their code and of all values that the code uses."""
+"""What results depend on: digests of functions and their values, of packages and of files."""
 
 from __future__ import annotations
 
 import argparse
 import copyreg
 import hashlib
+import json
+import os
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cached_property
+from importlib.util import find_spec
 from pathlib import Path
 from types import (
     CellType,
@@ -73,26 +76,64 @@ def name_of(function: Callable[..., Any]) -> str:
     return getattr(function, "__qualname__", type(function).__qualname__)
 
 
-def own_code(modules: Iterable[nn.Module]) -> dict[str, str]:
-    """Describe the code of modules that do not belong to this library, such as stages of the user.
+def packages_of(modules: Iterable[nn.Module]) -> set[str]:
+    """Return the packages of modules, and of the modules inside them, that belong to the user."""
+    tops = {type(part).__module__.partition(".")[0] for module in modules for part in module.modules()}
+    return tops - {"torch", "torchsar"}
+
+
+def code(packages: Iterable[str] = ()) -> dict[str, Any]:
+    """Describe the programs that results depend on besides the trial function.
 
     Args:
-        modules: Modules. Those inside them count as well.
+        packages: Further packages or modules, such as those of the user's stages.
 
     Returns:
-        A digest of all source files by the name of the package. A package without source files,
-        such as one in an archive, counts by its name. Empty if all modules belong to torchsar or
-        torch.
+        `code`, a digest of all files of torchsar and of each of the packages by its name; and
+        `versions`, those of torch and numpy. A package without files, such as one in an archive,
+        counts by its name.
     """
-    tops = {type(part).__module__.partition(".")[0] for module in modules for part in module.modules()}
-    found = {}
-    for top in sorted(tops - {"torchsar", "torch"}):
-        here = sys.modules.get(top)  # None if the module was loaded in another way
-        files = [file for folder in getattr(here, "__path__", ()) for file in sorted(Path(folder).rglob("*.py"))]
-        files = files or [Path(getattr(here, "__file__", None) or "")]
-        texts = [file.name.encode() + file.read_bytes() for file in files if file.is_file()]
-        found[top] = _digest(b"\0".join(texts))
-    return found
+    digests = {top: _digest(b"\0".join(_files(top))) for top in sorted({"torchsar", *packages})}
+    return {"code": digests, "versions": {"torch": torch.__version__, "numpy": np.__version__}}
+
+
+def _files(top: str) -> Iterator[bytes]:
+    """The names and contents of the source files of a package or module, loaded or not."""
+    spec = None if top in sys.modules else find_spec(top)
+    here = sys.modules.get(top, SimpleNamespace())
+    folders = getattr(here, "__path__", None) or (spec and spec.submodule_search_locations) or ()
+    files = [(Path(folder), file) for folder in folders for file in sorted(Path(folder).rglob("*.py"))]
+    alone = Path(getattr(here, "__file__", None) or (spec and spec.origin) or "")
+    for folder, file in files or [(alone.parent, alone)]:
+        if file.is_file():
+            yield file.relative_to(folder).as_posix().encode()
+            yield file.read_bytes()
+
+
+def files_in(tree: Any) -> dict[str, str]:
+    """Return digests of the contents of all files that a config names, by their path."""
+    if isinstance(tree, Mapping):
+        tree = list(tree.values())
+    if isinstance(tree, list):
+        return {path: digest for value in tree for path, digest in files_in(value).items()}
+    named = isinstance(tree, str) and 0 < len(tree) < 4096 and "\0" not in tree
+    return {tree: _digest(Path(tree).read_bytes())} if named and os.path.isfile(tree) else {}
+
+
+def changes(was: Any, now: Any, where: str = "") -> Iterator[str]:
+    """Yield what differs between two trees: the path, the earlier and the later value, as words."""
+    if isinstance(was, Mapping) and isinstance(now, Mapping):
+        for key in dict.fromkeys((*was, *now)):
+            name = f"{where}.{key}" if where else str(key)
+            yield from changes(was.get(key, "absent"), now.get(key, "absent"), name)
+    elif was != now:
+        yield f"{where} was {short(was)} and is {short(now)}"
+
+
+def short(value: Any) -> str:
+    """Return a value as a text of at most 60 characters."""
+    text = value if isinstance(value, str) else json.dumps(value).removesuffix(".0")
+    return text if len(text) <= 60 else text[:57] + "..."
 
 
 class _Reader:

@@ -7,7 +7,7 @@ import platform
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
@@ -19,7 +19,7 @@ import torch
 from torchsar.core import Draws, Source, device_fault
 from torchsar.metrics.intervals import half_width_ratio
 from torchsar.study.montecarlo.engines import Engine, Task, engine
-from torchsar.study.montecarlo.fingerprint import fingerprint, name_of
+from torchsar.study.montecarlo.fingerprint import code, fingerprint, name_of
 from torchsar.study.montecarlo.grid import Grid, make_grid
 from torchsar.study.montecarlo.record import OK, OUTCOME, Record
 from torchsar.study.montecarlo.store import Store, cut_off, empty, read_sweep
@@ -174,6 +174,7 @@ def sweep(
     config: Mapping[str, Any] | None = None,
     version: str | int | None = None,
     random: Source = "numpy",
+    allow_changed: bool = False,
 ) -> Record:
     """Run a trial function over a grid of parameters, many trials at once.
 
@@ -196,7 +197,8 @@ def sweep(
         batched: Names of the parameters that `trial` gets as float64 tensors (rows,). A batch has
             one value of any other parameter, which is passed unchanged.
         out: Folder for results.zarr; None keeps the results in memory only.
-        resume: Whether to continue a sweep that is in the folder.
+        resume: Whether to continue a sweep that is in the folder. One of another version of
+            torchsar, torch or numpy is refused, and so is one whose files of torchsar differ.
         chunk: Number of trials of a batch; None to choose it by the memory that a trial needs.
         workers: Number of worker processes on this machine; None to compute in this process.
         cluster: Address of a running dask scheduler, whose workers are used instead.
@@ -210,6 +212,8 @@ def sweep(
             it is resumed only if the code of `trial`, what it closes over and the global names that
             it uses are unchanged (see `torchsar.study.montecarlo.fingerprint`). Give a version if
             these change without an effect on the results, or if results depend on more than these.
+        allow_changed: Whether to continue such a sweep nevertheless, or that of another trial
+            function; the attribute `about` of the record then says what changed, under `changed`.
         random: Source of the random numbers: "numpy" draws them on the CPU, "torch" other ones on
             the device where they are used; see `torchsar.Draws`.
 
@@ -241,8 +245,8 @@ def sweep(
         store = None
         if folder is not None:
             about = fingerprint(trial) if version is None else {"name": name_of(trial), "version": version}
-            identity = {**identity_of_draws(seed, random), "trial": about, "config": dict(config or {})}
-            store = open_store(folder, plan, identity, resume)
+            identity = {**identity_of_draws(seed, random), "trial": about, "config": dict(config or {}), **code()}
+            store = open_store(folder, plan, identity, resume, allow_changed)
         return run_plan(plan, trial, store, engine(workers, cluster, threads)).select(plan.grid.labels)
 
 
@@ -254,10 +258,13 @@ def identity_of_draws(seed: int, random: Source) -> dict[str, Any]:
     return {"seed": seed, **({} if random == "numpy" else {"random": random})}
 
 
-def open_store(folder: ResultFolder, plan: Plan, identity: Mapping[str, Any], resume: bool) -> Store:
+def open_store(
+    folder: ResultFolder, plan: Plan, identity: Mapping[str, Any], resume: bool, allow_changed: bool = False
+) -> Store:
     """Open results.zarr in the folder of a sweep: with `resume` the existing store, else a new one.
 
-    A new store may replace an existing one in which no trial is marked as done.
+    A new store may replace an existing one in which no trial is marked as done. With
+    `allow_changed`, a store of another identity is continued, and holds both.
 
     Raises:
         ConfigError: If a new store would replace results, or the existing one belongs to another
@@ -266,7 +273,7 @@ def open_store(folder: ResultFolder, plan: Plan, identity: Mapping[str, Any], re
     path = folder.path / "results.zarr"
     there = path.exists() and not (folder.claimed and cut_off(path))
     if there and resume:
-        return Store.resume(path, plan.grid, plan.trials, identity)
+        return Store.resume(path, plan.grid, plan.trials, identity, allow_changed)
     if there and read_sweep(path).done.any():
         raise ConfigError(
             f"{folder.path} holds a sweep already; add --resume (resume=True) to go on with it, or choose another "
@@ -292,7 +299,9 @@ def run_plan(plan: Plan, trial: Trial, store: Store | None, engine: AbstractCont
         Interrupted: After Ctrl-C; finished trials are in the store, if there is one.
     """
     record = empty(plan.grid.labels, plan.trials) if store is None else store.record
-    run = _Run(plan, plan.work(trial), record, store)
+    held = {} if store is None else record.about["identity"]
+    work = replace(plan.work(trial), programs={key: held[key] for key in ("code", "versions") if key in held} or code())
+    run = _Run(plan, work, record, store)
     try:
         with engine as chosen:
             run.all_levels(chosen)

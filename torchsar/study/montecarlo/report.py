@@ -20,8 +20,8 @@ from torchsar.study.output.numbers import MISSING, number
 from torchsar.study.output.progress import clock
 from torchsar.study.output.report import Drawn, Picture, draw_all, write_page
 
-# parts of `about` that the report shows elsewhere, or that are too long for it
-_NOT_SHOWN = ("title", "config", "identity", "sessions", "chunk_rows")
+# parts of `about` that are shown elsewhere in the report, or are too long for it
+_NOT_SHOWN = ("title", "config", "identity", "earlier", "sessions", "chunk_rows")
 
 
 def write_sweep_report(

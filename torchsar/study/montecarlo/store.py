@@ -26,6 +26,7 @@ from zarr.codecs import Crc32cCodec
 
 from torchsar.core.stored import machine_memory_bytes
 from torchsar.io.seal import SEAL, address, array_metadata, canonical, checksum, document, group_attributes, sealed
+from torchsar.study.montecarlo.fingerprint import changes, short
 from torchsar.study.montecarlo.grid import Grid
 from torchsar.study.montecarlo.record import OUTCOME, Labels, Record, blank
 from torchsar.study.settings.errors import ConfigError, one_line
@@ -75,18 +76,37 @@ class Store:
             return cls(root, record)._begun(grid, identity)
 
     @classmethod
-    def resume(cls, path: Path, grid: Grid, trials: int, identity: Mapping[str, Any]) -> Store:
+    def resume(
+        cls, path: Path, grid: Grid, trials: int, identity: Mapping[str, Any], allow_changed: bool = False
+    ) -> Store:
         """Open an existing store, and enlarge it for new values of parameters and more trials.
 
+        With `allow_changed`, the results may come from another config, other files or other code:
+        the attribute `changed` then lists what differs and after how many trials, and `earlier` the
+        identities before this one.
+
         Raises:
-            ConfigError: If the store has the results of another config, or is damaged.
+            ConfigError: If the store has the results of another identity, or is damaged.
         """
         root = _opened(path, "r+")
-        _refuse_another(path, _attributes(root), _plain(identity), _values(grid))
+        held, changed = _attributes(root), _differing(path, _attributes(root), _plain(identity), _values(grid))
+        if changed and not allow_changed:
+            more = f", and {len(changed) - 3} more" if len(changed) > 3 else ""
+            raise ConfigError(
+                f"{path} holds a sweep of another config, trial function, file or version (hash "
+                f"{address(held['identity'])}, now {address(identity)}): {', '.join(changed[:3])}{more}; choose "
+                "another folder, restore what differs, or add --allow-changed (allow_changed=True) to mix both"
+            )
         record = _loaded(root, path)
         labels = {name: tuple(dict.fromkeys((*known, *grid.labels[name]))) for name, known in record.labels.items()}
         with _writing(path):
-            return cls(root, record.grown(labels, max(trials, record.trials)))._begun(grid, identity)
+            store = cls(root, record.grown(labels, max(trials, record.trials)))._begun(grid, identity)
+        if changed:
+            notes = [f"after {int(record.done.sum())} trials {text}" for text in changed]
+            earlier = [*held.get("earlier", []), held["identity"]]
+            store.note(changed=[*held.get("changed", []), *notes], earlier=earlier)
+            store.record.about = _about(store.root)
+        return store
 
     def _begun(self, grid: Grid, identity: Mapping[str, Any]) -> Store:
         known = _attributes(self.root).get("values", {})
@@ -402,11 +422,11 @@ def _spans(done: np.ndarray) -> list[list[int]]:
     return edges.reshape(-1, 2).tolist()
 
 
-def _refuse_another(
+def _differing(
     path: Path, held: Mapping[str, Any], identity: Mapping[str, Any], values: Mapping[str, Any]
-) -> None:
-    """Raise ConfigError if the store contains results of another config; the sentence names the
-    differences.
+) -> list[str]:
+    """Return the differences between the identity of a store and the present one as words; refuse
+    other parameters and labels of another meaning.
     """
     was = held["values"]
     if list(was) != list(values):
@@ -419,31 +439,10 @@ def _refuse_another(
             if was[name].get(label, value) != value:
                 raise ConfigError(
                     f"{path} holds a sweep in which {label!r} of the parameter {name} stands for "
-                    f"{_short(was[name][label])}, and now it stands for {_short(value)}; give the new value "
+                    f"{short(was[name][label])}, and now it stands for {short(value)}; give the new value "
                     "another label"
                 )
-    differing = list(_differences(held["identity"], identity))
-    if differing:
-        more = f", and {len(differing) - 3} more" if len(differing) > 3 else ""
-        raise ConfigError(
-            f"{path} holds a sweep of another config or trial function (hash {address(held['identity'])}, now "
-            f"{address(identity)}): {', '.join(differing[:3])}{more}; choose another folder, or give these keys their "
-            "earlier values"
-        )
-
-
-def _differences(was: Any, now: Any, where: str = "") -> Iterator[str]:
-    if isinstance(was, Mapping) and isinstance(now, Mapping):
-        for key in dict.fromkeys((*was, *now)):
-            name = f"{where}.{key}" if where else str(key)
-            yield from _differences(was.get(key, "absent"), now.get(key, "absent"), name)
-    elif was != now:
-        yield f"{where} was {_short(was)} and is {_short(now)}"
-
-
-def _short(value: Any) -> str:
-    text = value if isinstance(value, str) else json.dumps(value).removesuffix(".0")
-    return text if len(text) <= 60 else text[:57] + "..."
+    return list(changes(held["identity"], identity))
 
 
 def _values(grid: Grid) -> dict[str, dict[str, str]]:

@@ -6,7 +6,7 @@ import logging
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Any
@@ -19,6 +19,7 @@ from torch.utils._pytree import tree_leaves
 
 from torchsar.core import Draws, Outcome, is_out_of_memory
 from torchsar.study.memory import PeakMemory
+from torchsar.study.montecarlo.fingerprint import code
 from torchsar.study.montecarlo.grid import Case, Grid
 from torchsar.study.montecarlo.record import OK, OUTCOME
 from torchsar.study.settings.errors import ConfigError, one_line
@@ -189,13 +190,14 @@ class Computed:
 
 @dataclass(frozen=True)
 class Work:
-    """All data that a process needs to compute chunks."""
+    """All that a process needs to compute chunks, and the `code` that it must have."""
 
     trial: Trial
     grid: Grid
     draws: Draws
     device: str = "cpu"
     save: frozenset[int] = frozenset()
+    programs: Mapping[str, Any] = field(default_factory=code)
 
     @cached_property
     def cases(self) -> tuple[Case, ...]:

@@ -303,12 +303,14 @@ class Bench:
 
     @contextmanager
     def _named(self, what: str) -> Iterator[None]:
-        """Convert an error of the simulation to a ConfigError."""
+        """Turn an error of the simulation into a ConfigError, unless memory was short."""
         try:
             yield
         except ConfigError:
             raise
         except _FAILURES as error:
+            if is_out_of_memory(error):  # a smaller batch may succeed
+                raise
             raise ConfigError(f"{self.file}: {what}: {one_line(error).removeprefix(f'{what}: ')}") from error
 
     @contextmanager
