@@ -150,7 +150,7 @@ class Alternate(Stage):
         return _merged(found, [outcome for outcomes in used.values() for outcome in outcomes])
 
     def _without_others(self, signal: Signal, name: str, found: dict[str, Estimate]) -> Signal:
-        """Signal after the correctors of all turns but one."""
+        """Correct the signal with the results of all estimators except the named one."""
         for other, corrector in self.correctors.items():
             if other != name and other in found:
                 signal = corrector(signal, **_accepted(corrector, found[other].value))
@@ -168,7 +168,7 @@ def _parameters(stage: nn.Module) -> list[inspect.Parameter]:
 
 
 def _accepted(stage: nn.Module, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Those of the values that are parameters of the stage's `forward`."""
+    """Values, out of those given, that are parameters of the stage's `forward`."""
     return {p.name: values[p.name] for p in _parameters(stage) if p.name in values}
 
 

@@ -86,7 +86,7 @@ class Trace(Shown):
         return Summary(f"{sum(self.seconds.values()):.3g} s", tables)
 
     def _used(self, name: str) -> str:
-        """Numbers of trials in which a stage used neutral or doubtful values, as words."""
+        """Describe in words in how many trials a stage used neutral or doubtful values."""
         words = []
         for kind, masks in (("neutral", self.neutral), ("doubtful", self.doubtful)):
             for key, mask in masks.items():
@@ -98,9 +98,9 @@ class Trace(Shown):
 
 @dataclass
 class _Known:
-    """Values of a run by name, with the estimates that they come from.
+    """Named values of a run, with the estimates that they come from.
 
-    Those in `held`, and the estimates of the stages in `stages`, were given by the caller.
+    The caller gave the values named in `held` and the estimates of the stages named in `stages`.
     """
 
     values: dict[str, Tensor]
@@ -113,7 +113,7 @@ class _Known:
     draws: Draws | None = None
 
     def with_given(self, given: Given, stages: Mapping[str, nn.Module]) -> _Known:
-        """These values, replaced by those that the caller gives for the stages of a chain."""
+        """Replace values by those that the caller gives for the stages of a chain."""
         if not isinstance(given, Mapping):
             raise TypeError(f"`given` must map names to values or estimates, got {type(given).__name__}")
         values = {name: value for name, value in given.items() if not isinstance(value, Estimate)}
@@ -126,17 +126,17 @@ class _Known:
         return known
 
     def add(self, name: str, estimate: Estimate) -> None:
-        """Add the estimate of a stage, without values that the caller gives."""
+        """Add the estimate of a stage; values that the caller gave are not replaced."""
         self.estimates[name] = estimate
         self.values |= {f"{name}.{key}": v for key, v in estimate.value.items() if f"{name}.{key}" not in self.held}
 
     def recording(self, signal: Signal) -> Recording:
-        """A signal with the radar and the side data."""
+        """Combine a signal with the radar and the side data into a recording."""
         return Recording(signal, self.radar, self._under("aux."))
 
     @property
     def truth(self) -> Truth | None:
-        """True values; None without a simulation."""
+        """True values of the simulation; None if the data were not simulated."""
         values = self._under("truth.")
         return Truth(values, self.clean) if values else None
 
@@ -151,8 +151,9 @@ class _Known:
         self.radar, self.clean = recording.radar, self.clean if truth.clean is None else truth.clean
 
     def origin(self, source: str) -> tuple[Estimate, str] | None:
-        """The estimate that a value comes from, and its name there; None if the value is not
-        estimated or has no neutral one.
+        """Estimate that a value comes from, and its name there.
+
+        The result is None if the value is not estimated, was replaced, or has no neutral value.
         """
         name, _, key = source.partition(".")
         estimate = self.estimates.get(name)
@@ -163,7 +164,7 @@ class _Known:
 
 @dataclass
 class _Log:
-    """Record of a run that becomes its Trace."""
+    """Times, sizes and outputs of the stages of a run, from which its Trace is made."""
 
     inputs: dict[str, Signal] = field(default_factory=dict)
     outputs: dict[str, Signal] = field(default_factory=dict)
@@ -174,7 +175,7 @@ class _Log:
     arguments: dict[str, Mapping[str, Tensor]] = field(default_factory=dict)
 
     def trace(self, known: _Known) -> Trace:
-        """The trace of the run, with these values and estimates."""
+        """Make the trace of the run from the log and these values and estimates."""
         parts = {name: getattr(self, name) for name in ("seconds", "bytes", "neutral", "doubtful", "arguments")}
         parts |= {"metrics": known.metrics, "truth": known.truth}
         return Trace(self.inputs, self.outputs, known.estimates, known.values, **parts)
@@ -243,7 +244,9 @@ class Chain(Shown, nn.Module):
         return Summary(f"{len(stages)} stage{'s' * (len(stages) > 1)}", {"stages in their order": stages})
 
     def _check(self) -> None:
-        """Reject connections that do not fit, and required values without a connection."""
+        """Raise an error for connections that do not fit, and for required values without a
+        connection.
+        """
         available: set[str] = set()
         for name, stage in self.stages.items():
             parameters = _connectable(stage)
@@ -382,7 +385,7 @@ class Chain(Shown, nn.Module):
     def _start(
         self, x: Recording | Signal | None, given: Given | None, draws: Draws | None
     ) -> tuple[Signal | None, _Known]:
-        """The signal of a run, and the values that are known before it."""
+        """Signal with which a run starts, and the values that are known before its first stage."""
         random = [name for name, stage in self.stages.items() if _on_recording(stage)]
         begins = random[:1] == list(self.stages)[:1]
         if not isinstance(x, Recording | Signal) and not (x is None and begins):
@@ -407,7 +410,9 @@ class Chain(Shown, nn.Module):
         return x.signal if isinstance(x, Recording) else x, known
 
     def _part(self, trace: Trace, start: str, stop: str | None, given: Given | None) -> tuple[list[str], _Known]:
-        """The stages that a rerun repeats, and the values that it starts with."""
+        """Names of the stages that a rerun repeats, and the values that are known before the first
+        of them.
+        """
         names = list(self.stages)
         for name in (start, stop or start):
             if name not in names:
@@ -431,7 +436,7 @@ class Chain(Shown, nn.Module):
         return part, known
 
     def _run(self, names: list[str], signal: Any, known: _Known, log: _Log | None = None) -> Signal:
-        """The signal after some stages; before a simulation it is None."""
+        """Run the named stages in order; the signal before a simulation is None."""
         timed = log is not None and not torch.compiler.is_dynamo_compiling()
         for name in names:
             stage = self.stages[name]
@@ -456,8 +461,10 @@ class Chain(Shown, nn.Module):
         return signal
 
     def _arguments(self, name: str, known: _Known, required: bool) -> tuple[dict[str, Tensor], dict[str, Estimate]]:
-        """The connected values of a stage, and by "STAGE.PARAMETER" the estimates they come from,
-        as far as these have neutral values.
+        """Values connected to the parameters of a stage, and the estimates that they come from.
+
+        The estimates have the keys "STAGE.PARAMETER"; an estimate without a neutral value is left
+        out.
         """
         arguments, origins = {}, {}
         for parameter, source in self.uses[name].items():
@@ -484,8 +491,10 @@ class Chain(Shown, nn.Module):
         known: _Known,
         origins: dict[str, Estimate],
     ) -> Signal:
-        """The signal after a stage; its estimate joins `known`, and `origins` if the stage corrects
-        by it.
+        """Run a stage and return the signal after it.
+
+        Its estimate is added to `known`, and also to `origins` if the stage corrects the signal
+        with it.
         """
         if _on_recording(stage):
             assert known.draws is not None
@@ -516,19 +525,23 @@ class Chain(Shown, nn.Module):
 
 
 def _corrected(signal: Signal, out: Signal, estimate: Estimate) -> bool:
-    """Whether a stage that estimates has also changed the samples, on the same axes."""
+    """True if an estimating stage has also changed the samples, on the same axes."""
     same = out.axes == signal.axes and out.data.shape == signal.data.shape and estimate.outcome.shape == signal.trials
     return same and out is not signal
 
 
 def _connectable(stage: nn.Module) -> list[inspect.Parameter]:
-    """Parameters of a stage that `use` can connect; `connects` of one that calls a function."""
+    """Parameters of a stage that `use` can connect.
+
+    These are the parameters of `forward` after the signal, or `connects` of a stage that calls a
+    function.
+    """
     found = getattr(stage, "connects", None)
     return list(inspect.signature(stage.forward).parameters.values())[1:] if found is None else list(found)
 
 
 def _on_recording(stage: nn.Module) -> bool:
-    """Whether a stage makes or changes a recording, by random draws."""
+    """True for a stage that makes or changes a recording with random draws."""
     return getattr(stage, "on_recording", False)
 
 
@@ -538,7 +551,7 @@ def _provided(stage: nn.Module) -> Collection[str]:
 
 
 def _with_neutral(estimate: Estimate, stage: nn.Module | None) -> Estimate:
-    """An estimate with the neutral values of a stage where it has none, as that of a function."""
+    """Add the neutral values of a stage to an estimate that has none for them."""
     known = {key: number for key, number in getattr(stage, "neutral", {}).items() if not isinstance(number, str)}
     missing = {key: known[key] for key in estimate.value if key in known and key not in estimate.neutral}
     return replace(estimate, neutral={**estimate.neutral, **missing}) if missing else estimate

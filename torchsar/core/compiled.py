@@ -43,18 +43,18 @@ def call_as_one(stage: Any, args: Sequence[Any], values: Mapping[str, Any]) -> A
     """
     tensors = [x for x in pytree.tree_leaves((args, values)) if isinstance(x, Tensor)]
     for x in tensors:
-        [index(n) for n in x.shape]  # a length that is read as a number is a constant
+        [index(n) for n in x.shape]  # lengths that are read as numbers become constants
     names = [name for name in stage.fixed if values.get(name) is not None]
     if names and torch.is_grad_enabled() and any(x.requires_grad for x in tensors):
         return _call_apart(stage, args, values)
-    # torch.compile takes the text for a constant only as a part of another one
+    # torch.compile takes a text as a constant only if it is part of a longer text
     return _call(stage, args, values, [f"{name} {_digits(values[name])}" for name in names])  # pyright: ignore[reportCallIssue]
 
 
 @torch._dynamo.nonstrict_trace
 @torch.compiler.disable
 def _call(stage: Any, args: Sequence[Any], values: Mapping[str, Any], fixed: Sequence[str]) -> Any:
-    """Call a stage with the constants that `fixed` holds in place of the values given."""
+    """Call a stage with the constants in `fixed` instead of the values of the same names."""
     with ExitStack() as modes:
         if active_fake_mode() is not None:
             modes.enter_context(_Constants())
@@ -73,9 +73,10 @@ def _call(stage: Any, args: Sequence[Any], values: Mapping[str, Any], fixed: Seq
 
 
 class _Operands(TorchFunctionMode):
-    """Makes tensors of the host values of a traced program before a derivative refers to them.
+    """Context in which host values of a traced program become tensors before a derivative uses
+    them.
 
-    A tensor into which a function writes is left to `_Constants`, which refuses it.
+    A tensor that a function writes into is left to `_Constants`, which raises an error for it.
     """
 
     def __torch_function__(
@@ -83,7 +84,7 @@ class _Operands(TorchFunctionMode):
     ) -> Any:
         kwargs, name = kwargs or {}, getattr(func, "__name__", "")
         if not any(isinstance(mode, _Constants) for mode in _get_current_dispatch_mode_stack()):
-            return func(*args, **kwargs)  # within `untraced`
+            return func(*args, **kwargs)  # inside `untraced`
         inplace = name.endswith("_") and not name.endswith("__")
         written = int(inplace or name.startswith("__i") or name in ("__setitem__", "__set__"))
         lifted = pytree.tree_map(_lifted, (args[written:], {k: x for k, x in kwargs.items() if k != "out"}))
@@ -91,14 +92,15 @@ class _Operands(TorchFunctionMode):
 
 
 def _lifted(x: Any) -> Any:
-    """A tensor of the host as a value of the program, and anything else as it is."""
+    """Turn a host tensor into a value of the program, and return anything else unchanged."""
     return torch.ops.aten.lift_fresh_copy(x) if _of_host(x) else x
 
 
 class _Constants(TorchDispatchMode):
-    """Makes tensors of the host, such as tables that a stage keeps, values of a traced program.
+    """Context in which host tensors, such as tables of a stage, become values of a traced program.
 
-    "inductor" takes them in no other form. Writing into such a tensor raises a RuntimeError.
+    The compiler "inductor" takes them in no other form. Writing into such a tensor raises a
+    RuntimeError.
     """
 
     def __torch_dispatch__(
@@ -118,7 +120,7 @@ class _Constants(TorchDispatchMode):
 
 
 def _of_host(x: Any) -> bool:
-    """Whether a value is a tensor with numbers, and not one of a traced program."""
+    """True for a tensor that holds numbers and is not part of a traced program."""
     return type(x) is Tensor and not is_fake(x)
 
 
@@ -129,5 +131,5 @@ def _call_apart(stage: Any, args: Sequence[Any], values: Mapping[str, Any]) -> A
 
 @torch.compiler.assume_constant_result
 def _digits(x: Tensor) -> str:
-    """The numbers of a tensor as a text."""
+    """Hexadecimal digits of the bytes of a tensor."""
     return x.detach().cpu().contiguous().numpy().tobytes().hex()

@@ -1,4 +1,4 @@
-"""Connections of the parameters of stages to values of earlier ones."""
+"""Connections between parameters of stages and values of earlier stages."""
 
 from __future__ import annotations
 

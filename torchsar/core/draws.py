@@ -33,7 +33,7 @@ def generator_at(*address: str | int) -> np.random.Generator:
 
 
 def _key(*address: str | int) -> int:
-    """Hash of an address, a number of 128 bits."""
+    """Hash of an address as a whole number of 128 bits."""
     return int.from_bytes(hashlib.blake2b(repr(address).encode(), digest_size=16).digest(), "big")
 
 
@@ -134,11 +134,11 @@ class Draws:
         return list(zip(cases, trials, strict=True))
 
     def _keys(self, purpose: str) -> list[int]:
-        """Keys of the addresses of all trials."""
+        """Hash keys of the random numbers of all trials for one purpose."""
         return [_key(self.seed, purpose, *address) for address in self.addresses]
 
     def _of_trials(self, x: Tensor) -> Tensor:
-        """Numbers of all trials, without the leading dimension for a single trial."""
+        """Remove the leading dimension of random numbers if there is a single trial."""
         return x if self.trials is not None else x[0]
 
     def normal(
@@ -222,5 +222,5 @@ class Draws:
 
 
 def _device(device: torch.device | str | None) -> torch.device:
-    """The device; that of `torch.set_default_device` for None."""
+    """Device for random numbers: the given one, or torch's default device for None."""
     return torch.get_default_device() if device is None else torch.device(device)

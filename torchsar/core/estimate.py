@@ -84,7 +84,8 @@ class Outcome(IntEnum):
         return worst((otherwise, ~ok))
 
 
-# first codes of their kind; plain numbers, since torch.compile compares no tensor with an enum
+# Lowest codes of the doubtful and of the failed outcomes. They are plain numbers, because
+# torch.compile cannot compare a tensor with an enum.
 DOUBTFUL, FAILED = int(Outcome.INEXACT), int(Outcome.NOISE)
 _MESSAGES = {
     Outcome.OK: "the estimate is reliable",
@@ -277,16 +278,18 @@ class Estimate(Shown):
 
     @property
     def reasons(self) -> dict[Outcome, int]:
-        """Number of trials of each outcome other than OK; empty where the codes cannot be read, as
-        within `torch.func.vmap`.
+        """Number of trials of each outcome other than OK.
+
+        Empty where the codes cannot be read, as inside `torch.func.vmap`.
         """
         known = self.outcome.numel() and one_number(self.outcome.sum()) is not None
         return {code: n for code, n in counts(self.outcome).items() if code != Outcome.OK} if known else {}
 
     @property
     def _verdict(self) -> str:
-        """Number of trials in which the estimate is ok, and the reasons where it is not, as words,
-        such as "ok in 3 of 4 (noise: 1)".
+        """Describe in words in how many trials the estimate is ok, and the reasons in the others.
+
+        An example is "ok in 3 of 4 (noise: 1)".
         """
         count, total, reasons = one_number(self.ok.sum()), self.outcome.numel(), self.reasons
         if count is None:

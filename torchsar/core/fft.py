@@ -87,7 +87,9 @@ def fft_lines(x: Tensor, inverse: bool = False, n: int | None = None) -> Tensor:
 
 
 class _ContiguousGradient(torch.autograd.Function):
-    """Identity with a contiguous gradient, whose transform also rounds alike for any batch."""
+    """Identity whose gradient is made contiguous, so that its transform is rounded alike in any
+    batch.
+    """
 
     generate_vmap_rule = True
 
@@ -194,7 +196,7 @@ def over_blocks(work: Callable[[Any], None], parts: Iterable[Any], like: Tensor)
     inference = torch.is_inference_mode_enabled()
 
     def one(part: Any) -> None:
-        # modes and thread counts belong to a thread
+        # modes and thread counts must be set in each thread
         torch.set_num_threads(1)
         with torch.inference_mode(inference), torch.no_grad():
             work(part)
@@ -204,7 +206,7 @@ def over_blocks(work: Callable[[Any], None], parts: Iterable[Any], like: Tensor)
             for _ in pool.map(one, parts):
                 pass
     finally:
-        # the mathematics library counts threads for the whole process
+        # the mathematics library has one thread count for the whole process
         torch.set_num_threads(threads)
 
 
@@ -259,7 +261,7 @@ def transform_in_blocks(
     block_bytes = block_bytes_of(x.device) if block_bytes is None else block_bytes
     several = (
         dim == -2 and block_bytes // 16 // (source[0].numel() * source.element_size()) > 1
-    )  # small trials share blocks, the last may hold one
+    )  # small trials share a block, of which the last may have only one trial
 
     def work(part: tuple[slice, ...]) -> None:
         target[part] = fft_lines(source[part], inverse) if several else transform(source[part].contiguous(), dim=dim)
@@ -298,10 +300,11 @@ def spectrum_in_blocks(x: Tensor) -> Tensor:
 
 
 def _blocks(x: Tensor, dim: int, block_bytes: int) -> Iterator[tuple[slice, ...]]:
-    """Slices of (row, n) for a transform along dim -1, of (trial, n, column) for one along dim -2.
+    """Slices of an array, one for each block that is transformed at once.
 
-    Small trials share a slice, each large one is divided by columns: torch first copies a strided
-    transform of several trials.
+    A slice is (row, n) for a transform along dim -1 and (trial, n, column) along dim -2. Small
+    trials share a slice. A large trial is divided by columns, because torch copies the input before
+    a strided transform of several trials.
     """
     item = x[0].numel() * x.element_size()
     if dim == -1 or item <= block_bytes:
@@ -330,5 +333,5 @@ def smooth_length(n: int) -> int:
     """
     if n < 1:
         raise ValueError(f"an FFT has at least one sample, got the length {n}")
-    # numbers without prime factors above 5 divide a high power of 30
+    # a number without prime factors above 5 divides a high power of 30
     return next(k for k in range(n, 2 * n + 1) if pow(30, k.bit_length(), k) == 0)

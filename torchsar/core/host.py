@@ -16,12 +16,14 @@ from torch._subclasses.fake_tensor import is_fake
 from torch.utils._python_dispatch import _disable_current_modes
 
 Number = TypeVar("Number", bool, int, float)
-# raises an error if the values are not acceptable
+# function that raises an error if the numbers passed to it are not acceptable
 Check = Callable[..., None]
 
 
 class _Gathered(threading.local):
-    """The number of open blocks of `gathered_checks` in this thread, and the checks that wait."""
+    """State of a thread: number of open blocks of `gathered_checks`, and the checks not
+    made yet.
+    """
 
     def __init__(self) -> None:
         self.blocks = 0
@@ -236,11 +238,11 @@ def gathered_checks() -> Iterator[None]:
 
 
 def _read(x: Tensor) -> list[float] | None:
-    """The numbers in a tensor; None where they cannot be read."""
+    """Numbers in a tensor as a list; None where they cannot be read."""
     if is_traced(x):
         return None
     try:
-        # a tensor of a transform has no storage, from which `tolist` reads
+        # a tensor inside a torch.func transform has no storage that `tolist` could read
         return [one.item() for one in x.flatten()] if _is_mapped(x) else x.flatten().tolist()
     except RuntimeError as error:
         if "vmap" not in str(error):
@@ -249,19 +251,21 @@ def _read(x: Tensor) -> list[float] | None:
 
 
 def _is_mapped(x: Tensor) -> bool:
-    """Whether a tensor belongs to a transform of torch.func, outside which it must not be kept."""
+    """True for a tensor inside a torch.func transform, which must not be used outside the
+    transform.
+    """
     return torch._C._functorch.is_functorch_wrapped_tensor(x)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _taken() -> list[tuple[Tensor, Check]]:
-    """The checks that wait, which then no longer do."""
+    """Remove all postponed checks from the queue and return them."""
     waiting, _gathered.waiting = _gathered.waiting, []
     return waiting
 
 
 @untraced()
 def _make(checks: list[tuple[Tensor, Check]]) -> None:
-    """Make checks, with one reading for each device."""
+    """Make all checks; the numbers are read once for each device."""
     values: dict[torch.device, list[float]] = {}
     for device in dict.fromkeys(x.device for x, _ in checks):
         here = [x.flatten().to(torch.float64) for x, _ in checks if x.device == device]
@@ -304,7 +308,8 @@ def refuse_non_finite(
         ValueError: If a sample is NaN or infinite; the message has the number of such samples and
             the index of the first.
     """
-    # a lazily conjugated tensor has no real view; signs do not matter here
+    # a lazily conjugated tensor has no real view, and the sign of the imaginary part does not
+    # matter
     x = x.detach().resolve_conj()
 
     def refuse(finite: bool) -> None:
@@ -312,7 +317,7 @@ def refuse_non_finite(
             return
         bad = ~torch.isfinite(x)
         count = int(bad.sum())
-        # the sum of finite samples may overflow
+        # a sum that is not finite may also come from finite samples, which overflow
         if count:
             first = tuple(map(int, torch.unravel_index(bad.view(torch.uint8).argmax(), x.shape)))
             raise ValueError(
@@ -437,7 +442,7 @@ def level_of(x: Tensor, trailing: int = 2) -> Tensor:
     largest = part.amax(tuple(range(-trailing, 0)), keepdim=True)
     usual = (largest > 0) & torch.isfinite(largest)
     level = torch.exp2(torch.floor(torch.log2(torch.where(usual, largest, 1))))
-    # the reciprocal of a smaller number is infinite
+    # the reciprocal of a smaller number would be infinite
     return torch.where(usual, level.clamp_min(torch.finfo(level.dtype).tiny), 1)
 
 

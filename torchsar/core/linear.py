@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchsar.core.host import check_value
 
-_LARGEST_IN_BATCH = 128  # rows of matrices that are factorised in a batch
+_LARGEST_IN_BATCH = 128  # largest number of rows of matrices that are factorised as a batch
 
 
 def linear_solve(matrix: Tensor, right: Tensor) -> Tensor:
@@ -79,21 +79,22 @@ def cholesky_factor(matrix: Tensor) -> Tensor:
 
 
 def _large_batch(matrix: Tensor) -> bool:
-    """Whether matrices are factorised one by one, although they are a batch.
+    """True if the matrices of a batch must be factorised one by one.
 
-    With several threads torch's LU factors of a batch of more than 150 x 150 on a CPU are wrong on
-    some processors, with or without an error (https://github.com/pytorch/pytorch/issues/142815).
+    On some processors and with several threads, torch's LU factors of a batch of matrices larger
+    than 150 x 150 on a CPU are wrong. An error is not always raised
+    (https://github.com/pytorch/pytorch/issues/142815).
     """
     return matrix.device.type == "cpu" and matrix.shape[-1] > _LARGEST_IN_BATCH and matrix.shape[:-2].numel() > 1
 
 
 def _joined(results: Sequence[tuple[Tensor, Tensor]], trials: Sequence[int]) -> tuple[Tensor, ...]:
-    """Batch of results that were found one by one."""
+    """Stack results that were computed matrix by matrix into a batch."""
     return tuple(torch.stack(parts).unflatten(0, trials) for parts in zip(*results, strict=True))
 
 
 def _check(info: Tensor, what: str) -> None:
-    """Raise LinAlgError if LAPACK or its like reports a failure."""
+    """Raise LinAlgError if the status codes of a factorisation report a failure."""
 
     def check(failed: float) -> None:
         if failed:

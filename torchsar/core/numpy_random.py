@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-# numbers of a trial from which on trials are drawn by several threads
+# least count of numbers per trial for which several threads draw the trials
 _MANY = 1 << 15
 
 

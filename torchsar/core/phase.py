@@ -9,9 +9,9 @@ from torch import Tensor
 
 from torchsar.core.host import check_value, is_out_of_memory, is_traced
 
-# the distance of float64 numbers of this size is 6e-5 turn
+# largest phase in cycles; float64 numbers of this size are 6e-5 cycles apart
 MAX_TURNS = 4e11
-# measured: number of phasors from which on copies of their parts cost more than strided writing
+# measured count of phasors above which copying their parts takes longer than strided writing
 _FEW = 1 << 15
 # real dtype of each complex dtype
 _REAL = {torch.complex64: torch.float32, torch.complex128: torch.float64}
@@ -58,12 +58,12 @@ def cis(angle_rad: Tensor) -> Tensor:
     """
     if angle_rad.requires_grad or angle_rad.numel() < _FEW or is_traced(angle_rad):
         return torch.complex(torch.cos(angle_rad), torch.sin(angle_rad))
-    # without copies of the parts, whose fresh memory takes as long as the functions
+    # the parts are written in place, because allocating copies takes as long as the functions
     try:
         parts = angle_rad.new_empty((*angle_rad.shape, 2))
         torch.cos(angle_rad, out=parts[..., 0])
         torch.sin(angle_rad, out=parts[..., 1])
-    except RuntimeError as error:  # inside torch.func transforms `out=` is not available
+    except RuntimeError as error:  # `out=` is not available inside torch.func transforms
         if is_out_of_memory(error):
             raise
         return torch.complex(torch.cos(angle_rad), torch.sin(angle_rad))

@@ -9,9 +9,9 @@ from html import escape
 from torch import Tensor
 
 Rows = Sequence[Sequence[str]]
-# characters of a text in one line; in longer ones each part has a line
+# largest length of a text in one line; each part of a longer text has its own line
 _LINE = 100
-# styles of their own colours are absent, so that a page may be light or dark
+# no style sets a colour, so that pages with a light and with a dark background are readable
 _LEFT = 'style="text-align:left"'
 
 
@@ -144,7 +144,7 @@ def _joined(row: Sequence[str]) -> str:
 
 
 def _table(heading: str, rows: Rows) -> str:
-    """Rows as an HTML table; a column without words is left out."""
+    """Make an HTML table of rows, without empty columns."""
     width = max(map(len, rows))
     full = [[*row, *[""] * (width - len(row))] for row in rows]
     kept = [i for i in range(width) if any(row[i] for row in full)]

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchsar.core.host import refuse_non_finite
 from torchsar.core.show import Rows, Shown, Summary, content, in_bytes, kind_of
 
-# names of frequency axes by convention; other names get the suffix "_frequency"
+# conventional names of frequency axes; other axes get the suffix "_frequency"
 _DUAL_NAME = {"pulse": "doppler", "range": "range_frequency"}
 
 
@@ -140,9 +140,9 @@ class Axis:
         return Axis(name, self.n, -(self.n // 2) * step, step, unit, dual_start=self.start)
 
 
-# Limit of plausibility, for errors in files: 200 dB is a factor of 1e10 in amplitude.
+# limit of plausibility that detects errors in files: 200 dB is a factor of 1e10 in amplitude
 AGC_LIMIT_DB = 200.0
-# rounding of coordinates, in samples
+# tolerance for the rounding of coordinates, in samples
 _ROUNDING = 1e-6
 _ADVICE = "the numbers are too large for this type: scale the samples, or choose complex128"
 
@@ -328,7 +328,7 @@ class Signal(Shown):
         return Summary(f"{kind_of(self.data)}, {self.data.device}, {size}", {"axes": self._spans()})
 
     def _spans(self) -> Rows:
-        """Number of samples, first and last coordinate of each axis."""
+        """Rows of a table with the name, the number of samples and the coordinates of each axis."""
         return [(a.name, f"{a.n}", f"{a.start:.6g} to {a.stop:.6g} {a.unit}".rstrip()) for a in self.axes]
 
 
@@ -434,7 +434,9 @@ class Recording(Shown):
 
 
 def _indices(axis: Axis, chosen: float | slice) -> int | slice:
-    """Index of the sample next to a coordinate, or indices of those between two coordinates."""
+    """Index of the sample nearest to a coordinate, or slice of the samples between two
+    coordinates.
+    """
     part = isinstance(chosen, slice)
     if part and chosen.step is not None:
         raise ValueError(f"axis {axis.name!r}: a slice of coordinates has no step, got {chosen}; see `isel`")
@@ -453,7 +455,7 @@ def _indices(axis: Axis, chosen: float | slice) -> int | slice:
 
 
 def _as_tensor(value: Any, what: str) -> Tensor:
-    """torch.as_tensor with an error message that names the data."""
+    """Convert to a tensor like torch.as_tensor, with an error message that names the data."""
     try:
         return torch.as_tensor(value)
     except (TypeError, ValueError, RuntimeError):
@@ -462,7 +464,7 @@ def _as_tensor(value: Any, what: str) -> Tensor:
 
 
 def _whole(numbers: Tensor, what: str) -> Tensor:
-    """The numbers as integers; raises ValueError for others than whole numbers."""
+    """Convert numbers to integers; raise ValueError if they are not whole."""
     if numbers.dtype == torch.bool:
         raise ValueError(f"{what} must hold whole numbers, got {numbers.dtype}")
     if not numbers.is_floating_point():
@@ -474,7 +476,7 @@ def _whole(numbers: Tensor, what: str) -> Tensor:
 
 
 def _warn_of_empty_lines(samples: Tensor, what: str) -> None:
-    """Warn of lines that hold only zeros."""
+    """Warn of range lines that hold only zeros."""
     empty = ~samples.detach().bool().any(-1)
     count = int(empty.sum())
     if count:

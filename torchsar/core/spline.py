@@ -1,5 +1,6 @@
-"""Cubic splines through values at even or uneven knots, with their integral, and orthogonal
-polynomials, with which estimators describe smooth curves.
+"""Cubic splines and orthogonal polynomials, with which estimators describe smooth curves.
+
+A spline passes through values at even or uneven knots and can be integrated.
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv1d
 
-# root of z^2 + 4 z + 1 inside the unit circle: the influence of a knot k steps away is z^k
+# root of z^2 + 4 z + 1 inside the unit circle; a value acts on a point k knots away by z^k
 _DECAY = math.sqrt(3.0) - 2.0
-# half width of the truncated response in knots: |z|^32 = 5e-19 is below the precision of float64
+# half width of the truncated response in knots; |z|^32 = 5e-19 is below the precision of float64
 _REACH = 32
 
 
@@ -107,12 +108,15 @@ class Spline:
 
     @property
     def _steps(self) -> Tensor | float:
-        """Lengths of the intervals between the knots, or that of all of them."""
+        """Lengths of the intervals between the knots, or one length if the knots are even."""
         return self.knots.diff() if isinstance(self.knots, Tensor) else self.knots[1]
 
     @cached_property
     def _unit(self) -> list[Tensor]:
-        """Coefficients (..., n - 1) of the powers 0..3 of the time in intervals."""
+        """Coefficients of the powers 0 to 3 of the time in each interval, (..., n - 1) each.
+
+        The time runs from 0 to 1 in every interval.
+        """
         if isinstance(self.knots, Tensor):
             bend, square = _uneven_bend(self.values, self.knots), self.knots.diff().square()
             first, last = bend[..., :-1] * square, bend[..., 1:] * square
@@ -123,9 +127,9 @@ class Spline:
         return [y[..., :-1], y[..., 1:] - y[..., :-1] - (2 * first + last) / 6, first / 2, (last - first) / 6]
 
     def _sum(self, powers: Sequence[Tensor], t: Tensor) -> Tensor:
-        """Evaluate polynomials by Horner's rule, each time in its interval."""
+        """Evaluate a piecewise polynomial by Horner's rule in the interval of each time."""
         if isinstance(self.knots, Tensor):
-            # knots and times alone have fewer trials than the values, often none
+            # knots and times often have no trial dimensions even if the values have some
             few = np.broadcast_shapes(self.knots.shape[:-1], t.shape[:-1])
             knots, times = (x.expand(*few, -1).contiguous() for x in (self.knots, t))
             piece = torch.searchsorted(knots[..., 1:-1].detach().contiguous(), times.detach(), right=True)
@@ -134,7 +138,7 @@ class Spline:
             position = (t.to(torch.float64) - self.knots[0]) / self.knots[1]
             piece = torch.floor(position.detach()).clamp(0, self.values.shape[-1] - 2).to(torch.int64)
             offset, few = position - piece, ()
-        # the function of torch imports sympy at its first call, which takes half a second
+        # torch.broadcast_shapes imports sympy at its first call, which takes half a second
         lead = np.broadcast_shapes(powers[-1].shape[:-1], few)
         total = torch.zeros_like(offset)
         for c in reversed(powers):
@@ -186,12 +190,12 @@ def _dirichlet(known: Tensor) -> Tensor:
 
 
 def _power(k: Tensor) -> Tensor:
-    """Power z^k of whole numbers k >= 0; z is negative."""
+    """Power z^k for whole numbers k >= 0 and the negative root z = `_DECAY`."""
     return torch.where(k.remainder(2) == 0, 1.0, -1.0).to(k) * abs(_DECAY) ** k
 
 
 def _uneven_bend(values: Tensor, knots: Tensor) -> Tensor:
-    """Second derivatives at the knots, shape (..., n)."""
+    """Second derivatives of the spline at uneven knots, (..., n)."""
     h = knots.diff()
     slope = values.diff() / h
     n = values.shape[-1]
@@ -200,7 +204,8 @@ def _uneven_bend(values: Tensor, knots: Tensor) -> Tensor:
     known = 6 * slope.diff()
     if n == 3:
         return (known / (3 * (h[..., :1] + h[..., 1:]))).expand(*known.shape[:-1], 3)
-    # not-a-knot: the second derivative is linear over the first and over the last three knots
+    # The not-a-knot condition makes the second derivative linear over the first three knots and
+    # over the last three.
     (h0, h1), (g1, g0) = h[..., :2].split(1, -1), h[..., -2:].split(1, -1)
     below = torch.cat([torch.zeros_like(h0), h[..., 1:-2], g1 - g0 * g0 / g1], -1)
     above = torch.cat([h1 - h0 * h0 / h1, h[..., 2:-1], torch.zeros_like(g0)], -1)
@@ -214,8 +219,9 @@ def _uneven_bend(values: Tensor, knots: Tensor) -> Tensor:
 def _tridiagonal(below: Tensor, main: Tensor, above: Tensor, known: Tensor) -> Tensor:
     """Solve below[i] x[i-1] + main[i] x[i] + above[i] x[i+1] = known[i] by cyclic reduction.
 
-    Each step eliminates the neighbours of all unknowns at once, which doubles the distance of those
-    that are left. Rows are diagonally dominant, so that no pivots are needed.
+    Each step eliminates the neighbours of all unknowns at once, which doubles the distance between
+    the unknowns that remain in one equation. The rows are diagonally dominant, so that no pivots
+    are needed.
     """
     below, above, x = below / main, above / main, known / main
     step = 1
@@ -230,7 +236,7 @@ def _tridiagonal(below: Tensor, main: Tensor, above: Tensor, known: Tensor) -> T
 
 
 def _moved(x: Tensor, step: int) -> Tensor:
-    """x[i - step] at each i of the last dimension, zero where there is none."""
+    """Shift by `step` along the last dimension: element i of the result is x[i - step], or zero."""
     pad = (step, 0) if step > 0 else (0, -step)
     kept = x[..., : x.shape[-1] - step] if step > 0 else x[..., -step:]
     return torch.nn.functional.pad(kept, pad)

@@ -76,7 +76,7 @@ class Stage(nn.Module):
 
     def __call__(self, signal: Signal, *args: Any, **values: Any) -> Any:
         if torch.compiler.is_dynamo_compiling():
-            # imports torch._dynamo, which takes seconds
+            # local import: it loads torch._dynamo, which takes seconds
             from torchsar.core.compiled import call_as_one
 
             return call_as_one(self, (signal, *args), values)
@@ -84,7 +84,7 @@ class Stage(nn.Module):
             return self._called(signal, *args, **values)
 
     def _called(self, signal: Signal, *args: Any, **values: Any) -> Any:
-        """The result of a call, after the checks of its arguments."""
+        """Check the arguments of a call and run `forward`."""
         name = type(self).__name__
         if not isinstance(signal, Signal):
             raise TypeError(
@@ -105,7 +105,7 @@ class Stage(nn.Module):
         return result
 
     def _with_neutral(self, estimate: Estimate, given: Mapping[str, Any]) -> Estimate:
-        """The estimate with a neutral value for each value that has one."""
+        """Add the neutral values of the stage to an estimate, one for each value that has one."""
         numbers = {key: value for key, value in self.neutral.items() if not isinstance(value, str)}
         known = {key: value for key, value in given.items() if value is not None}
         neutral = {**numbers, **known, **estimate.neutral}
@@ -126,14 +126,16 @@ class Stage(nn.Module):
 
 
 def _explained(init: Callable[..., None]) -> Callable[..., None]:
-    """The constructor of a stage, whose errors have a note with its parameters and arguments."""
+    """Wrap the constructor of a stage so that its errors have a note with parameters and
+    arguments.
+    """
 
     @functools.wraps(init)
     def explained(self: Any, *args: Any, **kwargs: Any) -> None:
         try:
             init(self, *args, **kwargs)
         except (TypeError, AttributeError) as error:
-            # not that of a base class, whose arguments are others
+            # no note from a base class, which is called with other arguments
             if type(self).__init__ is explained:
                 given = textwrap.shorten(f"{args} and {kwargs}", 200)
                 error.add_note(f"{type(self).__name__}{inspect.signature(type(self))} was given {given}")

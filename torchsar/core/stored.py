@@ -16,7 +16,8 @@ from typing import IO
 
 import numpy as np
 
-# start of a file that holds a single array, and largest number of bytes before its numbers
+# _MAGIC: first bytes of a file that holds a single array
+# _LONGEST_HEADER: largest number of bytes before its numbers
 _MAGIC, _LONGEST_HEADER = b"\x93NUMPY", 1 << 16
 _AGAIN = "copy or save the file again"
 
@@ -55,7 +56,7 @@ class StoredArray:
 
     @property
     def described(self) -> str:
-        """The type and the shape in words, for messages."""
+        """Describe the type and the shape of the array in words."""
         return f"{self.dtype} of shape {self.shape}"
 
     def load(self, kinds: str = "") -> np.ndarray:
@@ -82,12 +83,12 @@ class StoredArray:
         try:
             with self.opened() as stream, np.errstate(over="ignore"):
                 return np.lib.format.read_array(stream, allow_pickle=False).astype(self._kept, copy=False)
-        except Exception as error:  # the parsers of numpy and zipfile raise errors of many kinds
+        except Exception as error:  # numpy and zipfile raise errors of many kinds
             raise ValueError(f"{self.what} cannot be loaded ({_reason(error)}); {_AGAIN}") from None
 
     @property
     def _kept(self) -> np.dtype:
-        """The type of loaded numbers."""
+        """Type of the numbers after loading: native byte order, and at most double precision."""
         widest = np.dtype({"f": np.float64, "c": np.complex128}.get(self.dtype.kind, self.dtype))
         return widest if self.dtype.itemsize > widest.itemsize else self.dtype.newbyteorder("=")
 
@@ -115,7 +116,7 @@ class StoredArray:
             raise ValueError(f"{self.what} was cut off while it was read; {_AGAIN}")
         if turned:
             part: np.ndarray = np.array(np.memmap(path, self.dtype, "r", begin, self.shape, "F")[first:last], order="C")
-        else:  # not mapped, since pages of a map count as memory of the process
+        else:  # read into memory, since the pages of a memory map count as memory of the process
             part = np.fromfile(path, self.dtype, (last - first) * row, offset=begin + first * row * self.dtype.itemsize)
         with np.errstate(over="ignore"):
             return part.reshape(last - first, *self.shape[1:]).astype(self._kept, copy=False)
@@ -147,11 +148,11 @@ class ArrayFile(Mapping[str, StoredArray]):
         self._members = {"": None} if start == _MAGIC else self._archived(start)
 
     def _archived(self, start: bytes) -> dict[str, zipfile.ZipInfo | None]:
-        """The members of the archive by name."""
+        """Members of the archive by the name of their array."""
         try:
             with zipfile.ZipFile(self.path) as archive:
                 found = [(info.filename.removesuffix(".npy"), info) for info in archive.infolist()]
-        except Exception as error:  # the parsers of numpy and zipfile raise errors of many kinds
+        except Exception as error:  # numpy and zipfile raise errors of many kinds
             if start.startswith(b"PK"):
                 raise ValueError(f"{self.path} is cut off or damaged ({_reason(error)}); {_AGAIN}") from None
             raise ValueError(
@@ -180,7 +181,7 @@ class ArrayFile(Mapping[str, StoredArray]):
             read = np.lib.format.read_array_header_1_0 if one else np.lib.format.read_array_header_2_0
             shape, turned, dtype = read(start)
             begin = start.tell() + (0 if info is None else _begin_of(self.path, info))
-        except Exception as error:  # the parsers of numpy and zipfile raise errors of many kinds
+        except Exception as error:  # numpy and zipfile raise errors of many kinds
             raise ValueError(f"{what} is damaged or no numpy array ({_reason(error)}); {_AGAIN}") from None
         if dtype.hasobject:
             raise ValueError(f"{what} must hold plain numbers without pickled objects, got {dtype}; convert it")
@@ -201,13 +202,13 @@ class ArrayFile(Mapping[str, StoredArray]):
 
 
 def _member(path: Path, info: zipfile.ZipInfo) -> IO[bytes]:
-    """A member of an archive as a stream."""
+    """Open a member of an archive as a stream."""
     with zipfile.ZipFile(path) as archive:
-        return archive.open(info)  # the file stays open until the stream is closed
+        return archive.open(info)  # the file is closed together with the stream
 
 
 def _begin_of(path: Path, info: zipfile.ZipInfo) -> int:
-    """Position of the first byte of a member of an archive, behind its header."""
+    """Position in the archive of the first byte of a member, after the header of the member."""
     with path.open("rb") as file:
         file.seek(info.header_offset)
         name, extra = struct.unpack("<26xHH", file.read(30))
@@ -215,5 +216,7 @@ def _begin_of(path: Path, info: zipfile.ZipInfo) -> int:
 
 
 def _reason(error: Exception) -> str:
-    """The beginning of the text of an error in one line, or its kind if the text is empty."""
+    """First words of an error message in one line, or the kind of the error if it has no
+    message.
+    """
     return textwrap.shorten(str(error), 120, placeholder=" ...") or type(error).__name__

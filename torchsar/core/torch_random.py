@@ -75,15 +75,15 @@ def _filled(
     dtype: torch.dtype,
     device: torch.device,
 ) -> Tensor:
-    """Numbers that `draw` fills in, (trial, *shape)."""
-    with torch.inference_mode(False):  # the threads that fill it have no inference mode
+    """Make a tensor (trial, *shape) of random numbers that `draw` fills in."""
+    with torch.inference_mode(False):  # the threads that fill the tensor are not in inference mode
         out = torch.empty(len(keys), *shape, dtype=dtype, device=device)
     fill(draw, out.unbind(), _generators(keys, device), math.prod(shape) if device.type == "cpu" else 0)
     return out
 
 
 def _generators(keys: Sequence[int], device: torch.device) -> list[torch.Generator]:
-    """A generator for each trial, seeded with the lower half of its key."""
-    # the device "meta" has no generators, as it has no numbers
+    """Random generators, one for each trial, seeded with the lower half of its key."""
+    # the device "meta" computes no numbers and has no generators
     place = torch.device("cpu") if device.type == "meta" else device
     return [torch.Generator(place).manual_seed(key % (1 << 64)) for key in keys]

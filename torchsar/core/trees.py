@@ -22,13 +22,16 @@ from torchsar.core.estimate import Estimate
 from torchsar.core.signal import Axis, Recording, Signal, Truth
 
 _NODES = (Tensor, Signal, Recording)
-# attribute of an object whose leaves are not tensors: its nodes and its structure
+# attribute that stores the nodes and the structure of an object whose leaves are not tensors
 _BARE = "_tree"
 _Structure = tuple[tuple[str, ...], dict[str, Any]]
 
 
 def _parts(x: Any) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Fields of an object with tensors, and the others; a mapping is divided between both."""
+    """Divide the fields of an object into those with tensors and the others.
+
+    The entries of a mapping are divided in the same way.
+    """
     nodes, static = {}, {}
     for name in (field.name for field in fields(x)):
         value = getattr(x, name)
@@ -50,7 +53,7 @@ def _flatten(x: Any) -> tuple[list[Any], _Structure]:
 
 
 def _numbers(axis: Axis) -> tuple[Any, ...]:
-    """What defines an axis; torch.compile makes constants of the numbers in a slice."""
+    """Parameters that define an axis. Numbers in a slice become constants in torch.compile."""
     return axis.name, axis.unit, slice(axis.n, axis.start, axis.step), slice(axis.dual_start)
 
 
@@ -60,8 +63,11 @@ def _flatten_with_keys(x: Any) -> tuple[list[tuple[Any, Any]], _Structure]:
 
 
 def _unflatten(kind: type, nodes: Iterable[Any], structure: _Structure) -> Any:
-    """The object with these tensors. torch also builds trees of other things, such as the numbers
-    of `in_dims`; the constructor would reject them, and the object keeps its structure instead.
+    """Rebuild an object from its tensors and its structure.
+
+    torch also builds such trees of other leaves, such as the numbers of `in_dims`. The constructor
+    would raise an error for them; therefore the object then only stores the leaves and the
+    structure.
     """
     names, static = structure
     whole, nodes = dict(static), list(nodes)
@@ -79,14 +85,14 @@ def _unflatten(kind: type, nodes: Iterable[Any], structure: _Structure) -> Any:
 
 
 def _holds_tensors(node: Any) -> bool:
-    """Whether all leaves of a tree are tensors."""
+    """True if all leaves of a tree are tensors."""
     if isinstance(node, dict):
         return all(map(_holds_tensors, node.values()))
     return isinstance(node, Tensor) or (isinstance(node, _NODES) and _BARE not in vars(node))
 
 
 def _collate(batch: Sequence[Any], *, collate_fn_map: dict[Any, Callable[..., Any]] | None = None) -> Any:
-    """Stack the tensors of several samples, with a new leading trial dimension."""
+    """Stack the tensors of several samples along a new leading trial dimension."""
     leaves, structures = zip(*(pytree.tree_flatten(sample) for sample in batch))
     odd = next((i for i, one in enumerate(structures) if one != structures[0]), None)
     if odd is not None:
@@ -100,7 +106,7 @@ def _collate(batch: Sequence[Any], *, collate_fn_map: dict[Any, Callable[..., An
 
 
 def _difference(one: Any, other: Any) -> str:
-    """The first part of the structure in which two objects differ, with both values."""
+    """Describe the first part of the structure in which two objects differ, with both values."""
     (nodes, static), (others, other_static) = _parts(one), _parts(other)
     for name, value in static.items():
         if value != other_static.get(name):

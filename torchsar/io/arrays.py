@@ -77,7 +77,7 @@ def read_images(path: str | Path) -> dict[str, Signal]:
 
 
 def _images(zarr: Any, group: Any, name: str) -> Iterator[tuple[str, Signal]]:
-    """The images in a group and in the groups below it."""
+    """Yield the names and the images of a group and of all groups below it."""
     image = group.get("image")
     if isinstance(image, zarr.Array):
         held = [(axis, group[axis]) for axis in image.metadata.dimension_names]

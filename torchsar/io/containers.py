@@ -22,7 +22,7 @@ from torchsar.radar.track import read_table
 from torchsar.spelling import did_you_mean
 
 Slices = tuple[slice, ...]
-# names of the real and the imaginary part in a compound type, in lower case
+# lower-case names of the real and the imaginary part in a compound type
 _PARTS = (("r", "i"), ("re", "im"), ("real", "imag"), ("i", "q"))
 
 
@@ -150,7 +150,8 @@ def open_container(path: Path, stack: ExitStack) -> Container | None:
         with reading(path, "MATLAB 5"):
             variables = MatlabFile(path)
         return Container(path, "MATLAB 5", lambda name: _whole(variables.load(name)), lambda: variables.names)
-    # the signature of HDF5 is at one of these bytes, after data of another program, such as MATLAB
+    # The signature of HDF5 is at one of these byte positions, after a header of another program,
+    # such as MATLAB.
     hdf5 = any(start.startswith(b"\x89HDF\r\n\x1a\n", at) for at in (0, 512, 1024, 2048))
     if hdf5 or start.startswith(b"MATLAB 7.3"):
         return _hdf5(path, stack, start.startswith(b"MATLAB"))
@@ -164,7 +165,7 @@ def open_container(path: Path, stack: ExitStack) -> Container | None:
 
 
 def _columns(columns: Mapping[str, np.ndarray], name: str) -> np.ndarray:
-    """One column of a table, or several, (row, column), whose names stand with commas between."""
+    """One column of a table, or several columns with names separated by commas, (row, column)."""
     held = [columns[one.strip()] for one in name.split(",")]
     return held[0] if len(held) == 1 else np.stack(held, -1)
 
@@ -199,7 +200,8 @@ def flat_array(
             f"keys{', or copy the file again if it was cut off' if held < needed else ''}"
         )
 
-    def part(slices: Slices) -> np.ndarray:  # mapped anew, so that parts that were read need no memory
+    # mapped for each part, so that parts read before take no memory
+    def part(slices: Slices) -> np.ndarray:
         mapped = np.memmap(path, np.uint8, "r", header)
         return np.array(np.ndarray(shape, dtype, mapped, prefix, (line, *inner[1:]))[slices])  # pyright: ignore[reportCallIssue, reportArgumentType]
 
@@ -207,7 +209,7 @@ def flat_array(
 
 
 def _hdf5(path: Path, stack: ExitStack, matlab: bool) -> Container:
-    """A file of h5py; MATLAB stores arrays with their dimensions reversed."""
+    """Open a file with h5py; the arrays of a MATLAB file have their dimensions in reverse order."""
     h5py, kind = library("h5py", "formats", f"reading {path}"), "MATLAB 7.3" if matlab else "HDF5"
     with reading(path, kind):
         file = stack.enter_context(h5py.File(path, "r"))
@@ -232,5 +234,5 @@ def _hdf5(path: Path, stack: ExitStack, matlab: bool) -> Container:
 
 
 def _whole(array: Any) -> tuple[Any, Callable[[Slices], np.ndarray]]:
-    """An array that has been read, and its parts."""
+    """Pair an array in memory with a function that returns parts of it."""
     return array, lambda slices: array[slices]

@@ -17,14 +17,17 @@ from torchsar.io.extras import library, reading
 from torchsar.io.inverse import history_radar
 from torchsar.radar import LIGHT_M_S, AntennaPath, LocalFrame, geocentric, range_profiles
 
-# largest error of a frequency in steps that is ignored, by choice: 3e-4 rad at the swath's edge
+# largest error of a frequency that is ignored, in frequency steps, by choice: it causes a phase
+# error of 3e-4 rad at the edge of the swath
 _SAME_STEP = 1e-4
-# samples that are transformed at once, by choice: 64 MB as complex128
+# number of samples that are transformed at once, by choice: 64 MB as complex128
 _BLOCK = 1 << 22
 _POSITIONS = ("TxPos", "RcvPos", "SRPPos")
 _NEEDED = ("TxTime", *_POSITIONS, "FX1", "FX2", "SC0", "SCSS")
-# frequencies of the profiles in Hz, delay of their middle relative to the reference point in
-# seconds, and the function that forms profiles of the samples (vector, sample) of some vectors
+# Three parts: the frequencies of the range profiles in Hz, and the delay of the middle of the
+# profiles relative to the reference point in seconds.
+# The last part is the function that computes the profiles of some vectors from their samples
+# (vector, sample).
 _Bands = tuple[Tensor, Tensor, Callable[[Tensor, slice], Tensor]]
 
 
@@ -101,7 +104,7 @@ class _Head(NamedTuple):
 
 
 def _refuse_version(start: bytes) -> None:
-    """Raise ValueError for a file that does not begin with a version of CPHD that can be read."""
+    """Raise ValueError unless a file begins with a version of CPHD that this module can read."""
     kind, _, version = start.partition(b"\n")[0].decode("latin-1").strip().partition("/")
     if kind != "CPHD":
         page = start.lstrip()[:1] == b"<"
@@ -114,8 +117,10 @@ def _refuse_version(start: bytes) -> None:
 
 
 def _refuse_channel(head: _Head, name: str, size: int) -> list[str]:
-    """Names of the channels; raise ValueError for one that does not exist, or has compressed
-    samples, or more of them than the bytes of the file hold.
+    """Names of all channels, after checks of the channel with the given name.
+
+    Raises ValueError if it does not exist, has compressed samples, or needs more bytes than the
+    file has.
     """
     channels = {node.findtext("{*}Identifier"): node for node in head.xml.element_tree.findall("{*}Data/{*}Channel")}
     if name not in channels:
@@ -134,7 +139,7 @@ def _refuse_channel(head: _Head, name: str, size: int) -> list[str]:
 
 
 def _recording(head: _Head, samples: np.ndarray, vectors: np.ndarray, dtype: torch.dtype) -> Recording:
-    """The recording of a channel."""
+    """Make the recording of a channel from its samples and the parameters of its vectors."""
     domain, sign, path = head("Global/DomainType"), int(head("Global/SGN")), head.path
     if domain not in ("FX", "TOA") or sign not in (-1, 1):
         raise ValueError(f"{path} must have the domain FX or TOA and the sign +1 or -1, got {domain!r} and {sign}")
@@ -160,7 +165,9 @@ def _recording(head: _Head, samples: np.ndarray, vectors: np.ndarray, dtype: tor
     edges = torch.tensor(np.asarray(head("SceneCoordinates/ImageAreaCornerPoints"), float))
     height = torch.full((len(edges),), frame.height_m, dtype=torch.float64)
     corners = frame.local_m(geocentric(edges[:, 0], edges[:, 1], height))
-    corners[:, 2] = 0  # the Earth falls away below the plane through the reference point
+    # corners are moved into the plane through the reference point, since the surface of the Earth
+    # falls below it
+    corners[:, 2] = 0
     antennas = AntennaPath(transmitter, receiver, legs[0] + legs[1] + LIGHT_M_S * shift_s)
     if head("CollectionID/CollectType") == "MONOSTATIC":
         antennas = _in_one_place(antennas, point, corners, float(frequency[-1]))
@@ -189,7 +196,7 @@ def _recording(head: _Head, samples: np.ndarray, vectors: np.ndarray, dtype: tor
 
 
 def _of_frequencies(n: int, of: dict[str, Tensor], path: Path) -> _Bands:
-    """How range profiles follow from vectors of n samples of the domain FX."""
+    """Conversion of vectors of n samples of the domain FX to range profiles."""
     start, step, k = of["SC0"], of["SCSS"], torch.arange(n, dtype=torch.float64)
     if not bool((step > 0).all() and (start > 0).all()):
         raise ValueError(
@@ -218,7 +225,7 @@ def _of_frequencies(n: int, of: dict[str, Tensor], path: Path) -> _Bands:
             return range_profiles(history)
         count, middle = len(frequency), len(frequency) // 2
         wide = frequency[1] - frequency[0]
-        delay = 1 / (count * wide)  # of cells, in seconds
+        delay = 1 / (count * wide)  # width of a range cell in seconds
         turns = (delay * grid)[:, 0]
         found = chirp_z(history, middle * turns, -turns, count, centre=n // 2)
         cells = torch.arange(count, dtype=torch.float64) - middle
@@ -229,10 +236,11 @@ def _of_frequencies(n: int, of: dict[str, Tensor], path: Path) -> _Bands:
 
 
 def _of_delays(n: int, of: dict[str, Tensor], path: Path) -> _Bands:
-    """How range profiles follow from vectors of n samples of the domain TOA.
+    """Conversion of vectors of n samples of the domain TOA to range profiles.
 
-    Cell m lies at the delay SC0 + m SCSS and has the phase of the carrier as in a range profile
-    about the reference point; about its middle n // 2 the carrier turns by f_c times the delay.
+    Cell m lies at the delay SC0 + m SCSS and has the carrier phase of a range profile with its
+    middle at the reference point. The middle n // 2 of the cells may have another delay; the
+    carrier phase is then corrected by f_c times this delay in cycles.
     """
     step, carrier = of["SCSS"], (of["FX1"] + of["FX2"]) / 2
     for name, value, scale in (("SCSS", step, step[0] / n), ("FX1 + FX2", carrier, 1 / (n * step[0]))):
@@ -242,14 +250,18 @@ def _of_delays(n: int, of: dict[str, Tensor], path: Path) -> _Bands:
                 f"{float(value.min()):.9g} to {float(value.max()):.9g}"
             )
     shift = of["SC0"] + n // 2 * step
-    shift = torch.where(shift.abs() < 1e-9 * step, 0, shift)  # rounding
+    # a difference from zero is due to rounding
+    shift = torch.where(shift.abs() < 1e-9 * step, 0, shift)
     frequency = carrier[0] + (torch.arange(n, dtype=torch.float64) - n // 2) / (n * step[0])
     return frequency, shift, lambda x, rows: x * unit_phasor((carrier[0] * shift)[rows, None], x.dtype)
 
 
 def _in_one_place(pair: AntennaPath, point: Tensor, corners: Tensor, highest_hz: float) -> AntennaPath:
-    """One antenna in the middle of two, where that changes no path over the area by more than a
-    thousandth of a wavelength, by choice; else the two.
+    """Replace two antennas by one in the middle between them if this changes the paths only
+    slightly.
+
+    The largest allowed change over the area is a thousandth of a wavelength, by choice. If it is
+    larger, both antennas are returned.
     """
     transmitter, receiver = pair.places
     middle = (transmitter + receiver) / 2

@@ -67,7 +67,7 @@ def export_recording(
 
 
 def _file(folder: Path, name: str) -> Path:
-    """Path of a file, in a folder that exists."""
+    """Path of a file in a folder, which is made if it does not exist."""
     path = folder / name
     path.parent.mkdir(parents=True, exist_ok=True)
     return path

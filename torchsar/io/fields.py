@@ -187,7 +187,8 @@ def shown(field: StoredArray) -> str:
     Returns:
         The value of a short field without dimensions, the type and the shape of any other.
     """
-    short = not field.shape and field.dtype.itemsize <= 64  # bytes of a value that fits a message
+    # largest number of bytes of a value that is shown in a message
+    short = not field.shape and field.dtype.itemsize <= 64
     return repr(field.load().item()) if short else field.described
 
 
@@ -269,20 +270,21 @@ def refuse_implausible(
         names: Names of the three for messages.
 
     Raises:
-        ValueError: If the carrier is not that of a radar or ladar; distance from the origin and
-            reference range differ by a factor of 1000; or the whole path is shorter than a quarter
-            of a wavelength.
+        ValueError: If the carrier is not that of a radar or ladar. The error is also raised if
+            distance from the origin and reference range differ by a factor of 1000, or if the whole
+            path is shorter than a quarter of a wavelength.
     """
-    low, high = 1e6, 3e15  # wavelengths of 300 m to 100 nm
+    low, high = 1e6, 3e15  # limits in Hz; the wavelengths are 300 m and 100 nm
     carrier, distance = float(frequency_hz.mean()), float(torch.linalg.vector_norm(position_m, dim=-1).median())
     if not low <= carrier <= high:
         unit = likely_unit(carrier, 1e8, 1e12, {"GHz": 1e9, "MHz": 1e6, "kHz": 1e3, "THz": 1e12})
         raise ValueError(f"{names[0]} is {carrier:.4g} Hz in the middle, and should be {low:g} to {high:g} Hz{unit}")
     reference, extent = float(reference_m.median()), position_m.amax(0) - position_m.amin(0)
     ratio = reference / distance if distance > 0 else 0.0
-    # where both are of one place they differ by some percent
+    # in the same unit, a path and its reference range differ by some percent
     for factor, of, other in ((1e3, names[1], names[2]), (1e-3, names[2], names[1])):
-        if 0.4 * factor < ratio < 2.5 * factor:  # 2, where a range stands for a path
+        # up to a factor of 2 because a one-way range may be given instead of the whole path
+        if 0.4 * factor < ratio < 2.5 * factor:
             near, far = (distance, reference) if factor > 1 else (reference, distance)
             raise ValueError(
                 f"{of} has a distance of {near:.4g} m, and {other} one of {far:.4g} m, about 1000 times as much; {of} "
@@ -304,19 +306,23 @@ def refuse_implausible(
 
 
 class Level:
-    """Mean and deviation of samples that come in blocks, by which an offset is noticed."""
+    """Mean and standard deviation of samples that are added in blocks, to detect an offset of I or
+    Q.
+    """
 
     def __init__(self) -> None:
         self._moments = np.zeros(4)
 
     def add(self, samples: np.ndarray) -> None:
-        """Count a block of complex samples."""
+        """Add the moments of a block of complex samples."""
         i, q = (part.astype(np.float64) for part in (np.real(samples), np.imag(samples)))
         self._moments += np.array([i.size, i.sum(), q.sum(), np.vdot(i, i) + np.vdot(q, q)])
 
     def warn(self, what: str, key: str) -> None:
-        """Warn of a mean above half the deviation, which receivers do not have; the key names what
-        removes it.
+        """Warn of a mean above half the standard deviation, which the samples of a receiver do not
+        have.
+
+        The message advises the user to set `key`, which removes the offset.
         """
         n, *sums, square = self._moments.tolist()
         i, q = (x / n for x in sums)

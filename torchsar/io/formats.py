@@ -36,7 +36,7 @@ class Format:
 
 
 def _read_archive(path: Path, dtype: torch.dtype) -> Recording:
-    """The recording in a numpy archive of any of the kinds that this package reads."""
+    """Read the recording in a numpy archive of any kind that this package reads."""
     keys = archive(path, "recorded data")
     if "iq" in keys:
         return read_stripmap(path, dtype)
@@ -55,7 +55,7 @@ _TABLE = (
     "is a table of numbers, such as a motion log, and holds no samples; name it in the sidecar of the samples (side: "
     'transmitter_m: {file: FILE, name: "x,y,z"}), or read it by torchsar.radar.read_track'
 )
-# the content decides, then the ending
+# the first bytes of a file determine its format; the ending of its name is the second choice
 FORMATS = (
     Format("CPHD", (".cphd",), (b"CPHD/",), read_cphd),
     Format("CRSD", (".crsd",), (b"CRSDsar/", b"CRSDtx/", b"CRSDrcv/"), _NOT_COMPRESSED),

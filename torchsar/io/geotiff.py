@@ -18,12 +18,14 @@ from torchsar.io.geometry import image_samples
 from torchsar.io.strip import StripImage
 from torchsar.radar import LocalFrame
 
-# largest distance in pixels between the affine map and the projection, by choice; images for which
-# it is larger get ground control points
+# Largest distance in pixels between the affine map and the projection, by choice.
+# Images with a larger distance are stored with ground control points.
 _MOST_PIXELS = 0.1
-# points along either axis at which the map is fitted, and which become control points
+# number of points along each axis at which the affine map is fitted, and which may become control
+# points
 _POINTS = 7
-# side of a tile in pixels, and bytes of written tiles in memory, by choice
+# _TILE: side of a tile in pixels, by choice
+# _CACHE_BYTES: bytes of written tiles that are in memory, by choice
 _TILE, _CACHE_BYTES = 512, 128 << 20
 
 
@@ -74,7 +76,8 @@ def write_geotiff(
     crs = f"EPSG:{_zone(frame)}"
     earth = frame.geocentric_m(local).numpy()
     x, y = (np.asarray(v) for v in warp.transform("EPSG:4978", crs, *earth.T.tolist())[:2])
-    terms = np.stack([columns + 0.5, rows + 0.5, np.ones_like(rows)], -1)  # pixels are areas
+    # half a pixel is added because coordinates of a GeoTIFF refer to the corners of pixels
+    terms = np.stack([columns + 0.5, rows + 0.5, np.ones_like(rows)], -1)
     affine, *_ = np.linalg.lstsq(terms, np.stack([x, y], -1), rcond=None)
     error = np.linalg.norm(terms @ affine - np.stack([x, y], -1), axis=-1).max() / image.grid.step_m
     place: dict[str, Any] = {"transform": rasterio.Affine(*affine[:, 0], *affine[:, 1])}
@@ -149,8 +152,10 @@ def write_strip_geotiff(image: StripImage, path: str | Path) -> None:
 
 
 def _north_up(values: np.ndarray, image: PathImage) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The image with rows closest to south and columns closest to east, the position of its first
-    pixel, and the steps along rows and columns in metres.
+    """Flip or transpose an image so that its rows are counted southward and its columns eastward.
+
+    The directions are only approximate. Also returns the position of the first pixel, and the steps
+    from row to row and from column to column in metres.
     """
     corner, step = image.grid.origin_m.numpy(), image.grid.step_m
     axes = [step * axis for axis in image.grid.axes.numpy()]
@@ -164,7 +169,7 @@ def _north_up(values: np.ndarray, image: PathImage) -> tuple[np.ndarray, np.ndar
 
 
 def _zone(frame: LocalFrame) -> int:
-    """Number of the projection in the register EPSG."""
+    """EPSG code of the map projection for the position of a local frame."""
     north = frame.latitude_deg >= 0
     if abs(frame.latitude_deg) > 84 or frame.latitude_deg < -80:
         return 32661 if north else 32761

@@ -139,7 +139,8 @@ def profiles_of(history: np.ndarray, what: str) -> Tensor:
         ValueError: If a sample is not finite.
     """
     data = torch.from_numpy(history).T
-    refuse_non_finite(data, what)  # the transform would spread them
+    # checked before the transform, which would spread NaN and Inf to all samples
+    refuse_non_finite(data, what)
     return range_profiles(data.to(torch.complex128)).contiguous()
 
 
@@ -191,7 +192,9 @@ def frequencies(field: StoredArray, n: int) -> Tensor:
 
 
 def _profiles_radar(fields: Mapping[str, StoredArray], shape: tuple[int, ...]) -> tuple[InverseRadar, dict[str, Any]]:
-    """Radar of range profiles; its bandwidth is c / (2 step), so that a range cell is the step."""
+    """Radar of recorded range profiles; its bandwidth is c / (2 step), so that a range cell is one
+    step.
+    """
     step, bandwidth = number(fields["range_step_m"]), number(fields["bandwidth_hz"])
     sampled = LIGHT_M_S / (2 * step)
     if bandwidth > 1.01 * sampled:
@@ -199,13 +202,13 @@ def _profiles_radar(fields: Mapping[str, StoredArray], shape: tuple[int, ...]) -
             f"range_step_m must be at most c / (2 B) for the bandwidth_hz B = {bandwidth:g}, "
             f"got {step:g} m, which samples only {sampled:g} Hz"
         )
-    # C band, commonly given in the literature for the Yak-42 recording, not verified
+    # carrier in C band commonly given in the literature for the Yak-42 recording; not verified
     carrier = number(fields["f0_hz"]) if "f0_hz" in fields else 5.52e9
     return InverseRadar(carrier, sampled, number(fields["prf_hz"])), {}
 
 
 def _turntable_radar(fields: Mapping[str, StoredArray], shape: tuple[int, ...]) -> tuple[InverseRadar, dict[str, Any]]:
-    """Radar and side data of a turntable sweep."""
+    """Radar and side data of a turntable measurement."""
     frequency = frequencies(fields["freq_hz"], shape[0])
     angle = torch.deg2rad(vector(fields["angle_deg"], shape[1]))
     prf = number(fields["prf_hz"]) if "prf_hz" in fields else 1.0
@@ -232,7 +235,7 @@ def _spotlight_radar(fields: Mapping[str, StoredArray], shape: tuple[int, ...]) 
     return history_radar(frequency, prf, float(reference.mean()), turn), aux
 
 
-# sample array of each kind of data, the keys that it requires, and the function for them
+# for each name of a sample array: the other keys that are required, and the function for its radar
 _READERS = {
     "profiles": (("range_step_m", "bandwidth_hz", "prf_hz"), _profiles_radar),
     "sig": (("freq_hz", "angle_deg"), _turntable_radar),

@@ -18,20 +18,21 @@ import numpy as np
 
 from torchsar.io.fields import joined
 
-# types of elements, class of structures and flag of complex numbers, of the format
+# numbers fixed by the format: types of elements, class of structures, and flag of complex numbers
 _MATRIX, _COMPRESSED, _STRUCT, _COMPLEX = 14, 15, 2, 0x800
-# numbers by the type of the element in which they are stored, of the format
+# numpy type of stored numbers for each type of element, fixed by the format
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
-# numbers by the class of the array, which may be wider, of the format
+# numpy type of an array for each class of array, fixed by the format; it may be wider than the
+# stored type
 _CLASSES = dict(enumerate(("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"), 6))
 
 
-# name of a variable or field, and the number of an element of an array of structures
+# name of a variable or field, with the number of an element if it is an array of structures
 _PLACE = re.compile(r"([^()]*)(?:\((\d+)\))?.*", re.DOTALL)
 
 
 class _Matrix(NamedTuple):
-    """Name of an array, its class with flags, its shape, and the elements that follow."""
+    """Header of an array, and the elements that follow it: name, class with flags, and shape."""
 
     name: str
     flags: int
@@ -62,7 +63,7 @@ class MatlabFile:
         for kind, content in self._elements(data[128:]):
             if kind not in (_MATRIX, _COMPRESSED):
                 raise ValueError("it is cut off or damaged, since a variable is none")
-            packed = kind == _COMPRESSED  # name and dims take far less than 4096 bytes
+            packed = kind == _COMPRESSED  # the name and the dims need far less than 4096 bytes
             start = zlib.decompressobj().decompress(content[:4096], 4096)[8:] if packed else content
             self._variables[self._matrix(memoryview(start)).name] = kind, content
         self.names = list(self._variables)
@@ -93,7 +94,7 @@ class MatlabFile:
         return self._numbers(held, name)
 
     def _matrix(self, data: memoryview) -> _Matrix:
-        """The array in the content of an element."""
+        """Parse the content of an element as an array."""
         elements = self._elements(data)
         flags, dims, name = (next(elements, (0, b""))[1] for _ in range(3))
         shape = tuple(np.frombuffer(dims, f"{self._order}i4").tolist())
@@ -103,7 +104,7 @@ class MatlabFile:
         return _Matrix(bytes(name).decode("latin-1"), kind, shape, elements)
 
     def _field(self, held: _Matrix, owner: str, index: str | None, wanted: str) -> _Matrix:
-        """The array in a field of a structure, or of an element of an array of structures."""
+        """Find the array in a field of a structure, or of one element of an array of structures."""
         count = math.prod(held.shape)
         if held.flags & 0xFF != _STRUCT:
             raise KeyError(wanted)
@@ -125,7 +126,7 @@ class MatlabFile:
         return self._matrix(data)
 
     def _numbers(self, held: _Matrix, name: str) -> np.ndarray:
-        """The numbers of an array."""
+        """Parse the numbers of an array."""
         kind, parts = held.flags & 0xFF, []
         if kind not in _CLASSES:
             raise ValueError(
@@ -135,19 +136,21 @@ class MatlabFile:
             stored, data = next(held.elements, (0, b""))
             if stored not in _STORED or len(data) != math.prod(held.shape) * int(_STORED[stored][1]):
                 raise ValueError(f"{name} is damaged, since its size is not that of its shape {held.shape}")
-            with np.errstate(invalid="ignore"):  # integers have a checked size, but not a checked type
+            # the size of the stored numbers is checked, but not whether they fit the type of the
+            # array
+            with np.errstate(invalid="ignore"):
                 part = np.frombuffer(data, self._order + _STORED[stored]).astype(_CLASSES[kind])
             parts.append(part.reshape(held.shape, order="F"))
         return parts[0] if len(parts) == 1 else joined(*parts)
 
     def _elements(self, data: memoryview) -> Iterator[tuple[int, memoryview]]:
-        """The type and the content of one element after another."""
+        """Yield the type and the content of each element."""
         while len(data):
             if len(data) < 8:
                 raise ValueError("it is cut off or damaged, since an element is missing")
             kind, size = np.frombuffer(data[:8], f"{self._order}u4").tolist()
             first, after = 8, 8 + (size if kind == _COMPRESSED else -(-size // 8) * 8)
-            if kind >> 16:  # a small element, with its content in the tag
+            if kind >> 16:  # a small element, whose content is inside the tag
                 kind, size, first, after = kind & 0xFFFF, kind >> 16, 4, 8
             if (size > 4 and first == 4) or first + size > len(data):
                 raise ValueError(f"it is cut off or damaged, since an element has {len(data) - first} of {size} bytes")

@@ -42,7 +42,8 @@ def write_netcdf(signal: Signal, path: str | Path, title: str = "") -> None:
     h5py = library("h5py", "formats", f"writing {path}")
 
     def write(part: Path) -> None:
-        with h5py.File(part, "w", track_order=True) as file:  # netCDF lists variables in this order
+        # netCDF lists variables in the order in which they were created
+        with h5py.File(part, "w", track_order=True) as file:
             file.attrs["Conventions"], file.attrs["title"] = "CF-1.8", title
             for number, axis in enumerate(signal.axes):
                 scale = file.create_dataset(axis.name, data=axis.values().numpy(), track_order=True)

@@ -113,7 +113,7 @@ def describe_path(fields: Mapping[str, StoredArray], path: Path) -> Described:
 
 
 def _places(fields: Mapping[str, StoredArray], antenna: str, pulses: int, time: Tensor | None) -> Tensor | None:
-    """Positions of an antenna at the pulses, float64 (pulse, 3); None if there are none."""
+    """Positions of an antenna at all pulses, float64 (pulse, 3); None if the archive has none."""
     if f"{antenna}_m" not in fields:
         return None
     field, records = fields[f"{antenna}_m"], fields.get(f"{antenna}_time_s")
@@ -130,7 +130,8 @@ def _places(fields: Mapping[str, StoredArray], antenna: str, pulses: int, time: 
         with naming(fields["origin_deg_m"].what):
             frame = LocalFrame(*origin)
         low = float(torch.linalg.vector_norm(place, dim=-1).min())
-        if low < 6.3e6:  # metres, below the surface of the Earth
+        # in metres: a smaller distance from the centre of the Earth is below its surface
+        if low < 6.3e6:
             raise ValueError(
                 f"{field.what} must be geocentric coordinates in metres where origin_deg_m is given, but has a "
                 f"distance of {low:.4g} m from the centre of the Earth, such as {place.reshape(-1, 3)[0].tolist()}; "
@@ -146,7 +147,9 @@ def _places(fields: Mapping[str, StoredArray], antenna: str, pulses: int, time: 
 
 
 def _prf_hz(fields: Mapping[str, StoredArray], time: Tensor | None) -> float:
-    """Pulse repetition frequency, the mean one if it follows from the times of the pulses."""
+    """Pulse repetition frequency (Hz): the given one, or the mean one computed from the times of
+    the pulses.
+    """
     if "prf_hz" in fields or time is None:
         return number(fields["prf_hz"]) if "prf_hz" in fields else 1.0
     span = float(time[-1] - time[0])

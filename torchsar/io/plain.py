@@ -133,7 +133,7 @@ def read_points(
 
 
 def _columns(path: Path) -> dict[str, np.ndarray]:
-    """Columns of a table, or of the vertices of a mesh."""
+    """Read the columns of a table, or the coordinates of the vertices of a mesh."""
     refuse_absent(path, "a file of points")
     kind = path.suffix.lower().removeprefix(".")
     if kind not in ("ply", "obj"):

@@ -1,6 +1,6 @@
 """Reader of recorded raw stripmap data in `.npz` files.
 
-`Recording.from_arrays` makes a recording from arrays in any other form.
+For data in arrays in memory, `Recording.from_arrays` makes the recording.
 """
 
 from __future__ import annotations
@@ -32,10 +32,11 @@ from torchsar.io.fields import (
 from torchsar.radar import LIGHT_M_S, LinearFM, StripmapRadar
 from torchsar.repair.placing import LinePlan, regular_lines
 
-# keys of the archive: samples, then numbers
+# required keys of the archive: the samples, then the parameters of the radar
 _REQUIRED = ("iq", "fs_hz", "prf_hz", "f0_hz", "chirp_rate_hz_s", "pulse_s", "slant_range_cell1_m", "v_eff_m_s")
-# least and largest accepted number with its unit, chosen far beyond those of any recording, sonar
-# included: a wrong unit or a damaged number is outside
+# Least and largest accepted value of each parameter, and its unit.
+# The limits are far beyond the values of any recording, including sonar. Only a wrong unit or a
+# damaged number exceeds them.
 _RANGES = {
     "fs_hz": (1e3, 1e13, "Hz"),
     "prf_hz": (1e-3, 1e8, "Hz"),
@@ -45,7 +46,7 @@ _RANGES = {
 }
 # optional keys that become side data of the recording
 _AUX = ("agc_db", "line_number", "line_time_s", "pilot")
-# numbers that may differ from line to line
+# parameters that may be given for each line
 _VARYING = ("prf_hz", "slant_range_cell1_m")
 
 
@@ -99,7 +100,8 @@ def read_stripmap(path: str | Path, dtype: torch.dtype = torch.complex64, regula
     """
     recording = read_described(path, dtype, "raw stripmap data", describe_stripmap)
     level = Level()
-    for block in recording.signal.data.split(1024):  # lines, so that copies are small
+    # in blocks of 1024 lines, so that temporary copies are small
+    for block in recording.signal.data.split(1024):
         level.add(block.numpy())
     level.warn(str(path), "offset")
     if not regular:
@@ -168,13 +170,15 @@ def describe_stripmap(fields: Mapping[str, StoredArray], path: Path) -> Describe
 
 
 def _samples(iq: np.ndarray, offset: complex) -> np.ndarray:
-    """Complex samples (line, sample) of complex ones, or of I and Q, without their offset."""
+    """Convert samples, or pairs of I and Q, to complex samples (line, sample) and subtract their
+    offset.
+    """
     data = iq if iq.ndim == 2 else joined(iq[..., 0], iq[..., 1])
     return data - offset if offset else data
 
 
 def _offset(fields: Mapping[str, StoredArray]) -> complex:
-    """What samples exceed their true values by."""
+    """Offset of the recorded samples from their true values, I + j Q."""
     if "offset" not in fields:
         return 0
     both = np.broadcast_to(fields["offset"].load("iuf"), 2) if fields["offset"].shape in ((), (1,), (2,)) else None
@@ -186,8 +190,8 @@ def _offset(fields: Mapping[str, StoredArray]) -> complex:
 
 
 def _refuse_implausible(numbers: Mapping[str, float], c: float) -> None:
-    """Raise ValueError for numbers that no recording has; c in m/s."""
-    # wavelengths of 15 m to 30 nm, chosen likewise
+    """Raise ValueError for parameters that no recording has. c: wave speed in m/s."""
+    # carrier limits of wavelengths from 15 m to 30 nm, also far beyond any recording
     ranges = {**_RANGES, "f0_hz": (c / 15, c / 3e-8, "Hz")}
     for key, (low, high, unit) in ranges.items():
         if not low <= numbers[key] <= high:
@@ -218,7 +222,9 @@ def _refuse_implausible(numbers: Mapping[str, float], c: float) -> None:
 
 
 def _side(field: StoredArray, name: str, iq: StoredArray) -> np.ndarray:
-    """Side data, which have an entry per line or per sample; a pilot tone is one row."""
+    """Load side data after a check of their size: an entry for each line or sample, or one row for
+    a pilot.
+    """
     if name == "pilot" and (len(field.shape) != 1 or 0 in field.shape):
         raise ValueError(f"{field.what} must be one row of samples, got {field.described}")
     if math.prod(field.shape) > math.prod(iq.shape):

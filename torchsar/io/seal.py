@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-# entry of a tree that holds its checksum
+# entry of a tree in which its checksum is stored
 SEAL = "checksum"
 
 
@@ -91,11 +91,11 @@ def _plain(x: Any) -> Any:
         return {str(k): _plain(v) for k, v in x.items()}
     if isinstance(x, (list, tuple)):
         return [_plain(v) for v in x]
-    # beyond 2^53, a float would make neighbouring whole numbers alike
+    # a float would make different whole numbers above 2^53 equal
     if x is None or isinstance(x, (bool, str)) or (isinstance(x, int) and abs(x) > 2**53):
         return x
     if isinstance(x, (int, float)):
-        return float(x) + 0.0  # the sum makes -0.0 and 0.0, which are equal, alike
+        return float(x) + 0.0  # the addition turns -0.0 into 0.0, which is an equal number
     return _plain(x.tolist()) if hasattr(x, "tolist") else repr(x)
 
 

@@ -39,7 +39,7 @@ def read_sicd(path: str | Path, dtype: torch.dtype = torch.complex64) -> Signal:
     path = Path(path)
     sarkit = library("sarkit.sicd", "formats", f"reading {path}")
     with reading(path, "SICD"), path.open("rb") as file:
-        # the length of the file, which the header of NITF 2.1 holds here
+        # the header of NITF 2.1 has the length of the file here
         start, held = file.read(354), path.stat().st_size
         length = start[342:]
         if not start.startswith((b"NITF", b"NSIF")):
@@ -77,7 +77,7 @@ def read_sicd(path: str | Path, dtype: torch.dtype = torch.complex64) -> Signal:
 
 
 def _complex(image: np.ndarray, xml: Any) -> np.ndarray:
-    """Samples of any type of pixel as complex numbers in the byte order of the machine."""
+    """Convert pixels of any type to complex samples in the byte order of the machine."""
     if not image.dtype.names:
         return image.astype("c8")
     first, second = (image[name].astype("f4") for name in image.dtype.names)

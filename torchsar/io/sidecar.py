@@ -29,13 +29,16 @@ from torchsar.io.path import describe_path
 from torchsar.io.recorded import describe_stripmap
 from torchsar.spelling import did_you_mean
 
-# bytes of a block of complex samples, large enough for fast reading
+# size in bytes of a block of complex samples, large enough for fast reading
 _BLOCK_BYTES = 32 << 20
 
 
 class _Kind(NamedTuple):
-    """Dims of a sample array, and the keys beside it with their units: numbers of the radar, and
-    side arrays, each with the dim whose length it has.
+    """Description of a kind of sample array.
+
+    Fields: `dims` has its dims. `radar` has the keys of the radar parameters with their units.
+    `side` has the keys of side arrays, each with its unit and the dim that gives its length.
+    `describe` checks the archive.
     """
 
     dims: tuple[str, str]
@@ -45,7 +48,7 @@ class _Kind(NamedTuple):
 
 
 _PRF, _FREQUENCY = {"prf_hz": "Hz"}, {"freq_hz": ("Hz", "frequency")}
-# sample arrays with their keys, as the readers take them
+# kinds of sample arrays that the readers accept, by the key of the samples
 _KINDS = {
     "iq": _Kind(
         ("pulse", "range"),
@@ -85,7 +88,7 @@ _KINDS = {
     ),
 }
 _SYSTEMS = {"stripmap": ("iq",), "isal": ("profiles", "sig", "fp"), "path": ("history", "fp")}
-# factors of other units for each unit of a key
+# accepted units for each unit of a key, with the factors of conversion
 _UNITS = {
     "Hz": {"Hz": 1.0, "kHz": 1e3, "MHz": 1e6, "GHz": 1e9, "THz": 1e12},
     "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "ps": 1e-12},
@@ -100,7 +103,7 @@ _DTYPES = (
     *("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "float16", "float32", "float64"),
     *("complex64", "complex128"),
 )
-# keys of a section with the types of their values, and these in words
+# accepted keys of a section, each with the type of its value and with this type in words
 _Keys = Mapping[str, tuple[Any, str]]
 _BYTES = (int, "a number of bytes")
 _FLAT: _Keys = {
@@ -223,26 +226,31 @@ def import_recording(path: str | Path, sidecar: Mapping[str, Any], out: str | Pa
                 stored[one] = StoredArray(f"{where}.{one}", x.shape, x.dtype, partial(_stream, x))
         stored[key] = StoredArray(f"{name}: samples", shape, samples.dtype, partial(_stream, np.zeros(())))
         found = kind.describe(stored, Path(name))
-        with naming(name):  # side data that only a recording checks, with one sample per line
+        # adds the name of the sidecar to errors of side data that are only checked when a recording
+        # is made
+        with naming(name):
             lines = torch.ones(lengths["pulse"], 1, dtype=torch.complex64)
             Recording.from_arrays(lines, found.radar, what=name, **found.aux)
         level = Level()
         write_whole(out, lambda part: _write(part, key, samples, slow, turned, arrays, level))
-    if key == "iq" or unsigned:  # in a phase history a constant may be a target
+    # no check of a signed phase history, in which a target may cause a constant
+    if key == "iq" or unsigned:
         level.warn(samples.what, f"{name}: samples.offset")
     return out
 
 
 class _File(NamedTuple):
-    """The file of the data, and a function that opens it and others, each of them once."""
+    """Path of the data file, and a function that opens this or another file only once."""
 
     path: Path
     opened: Callable[[Path], Container | None]
 
 
 def _samples(file: _File, tree: Mapping[str, Any], where: str, order: tuple[str, str]) -> tuple[BlockArray, str, bool]:
-    """The samples as one complex array (slow, fast), in the order of the file, the name of its slow
-    dim, and whether the numbers in the file have no sign.
+    """Combine the sample arrays in the file into one complex array in the order of the file.
+
+    Returns the array, the name of its slow dim, which is its first one, and whether the stored
+    numbers are unsigned.
     """
     dims, choose = [str(one) for one in tree["dims"]], dict(tree.get("choose", {}))
     further, pair = [one for one in dims if one not in (*order, "iq")], "iq" in dims
@@ -309,7 +317,7 @@ def _samples(file: _File, tree: Mapping[str, Any], where: str, order: tuple[str,
 def _order(
     tree: Mapping[str, Any], where: str, dims: list[str], shape: Mapping[str, int], slow: str
 ) -> Callable[[np.ndarray], Sequence[np.ndarray]]:
-    """The function that parts I and Q, by the order in which they follow each other."""
+    """Function that separates I and Q according to their order in the file."""
     order = tree.get("order", "iq")
     if "iq" not in dims and "order" in tree:
         raise ValueError(f"{where}.order is for samples with a dim iq, got the dims {dims}")
@@ -324,7 +332,7 @@ def _order(
 
 
 def _offset(tree: Mapping[str, Any], where: str) -> complex:
-    """What is subtracted from complex samples."""
+    """Complex offset that is subtracted from the samples."""
     given = tree.get("offset", 0)
     both = list(given) if isinstance(given, (list, tuple)) else [given, given]
     if len(both) != 2 or not all(type(x) in (int, float) and math.isfinite(x) for x in both):
@@ -333,7 +341,7 @@ def _offset(tree: Mapping[str, Any], where: str) -> complex:
 
 
 def _array(file: _File, path: Path, tree: Mapping[str, Any], where: str) -> BlockArray:
-    """The array in a file that `name` or the layout of a flat binary file describes."""
+    """Find the array that `name` or the layout of a flat binary file describes."""
     container = file.opened(path)
     flat = [key for key in _FLAT if key in tree]
     if container is not None:
@@ -360,7 +368,10 @@ def _array(file: _File, path: Path, tree: Mapping[str, Any], where: str) -> Bloc
 
 
 def _value(file: _File, value: Any, where: str, own: str, n: int | None) -> np.ndarray:
-    """The numbers of a key in its own unit; n is their number if it is that of a dim."""
+    """Load the numbers of a key and convert them to its unit.
+
+    own: unit of the key. n: expected count of numbers, or None if it is not the length of a dim.
+    """
     unit = None
     if isinstance(value, str):
         match = _WITH_UNIT.fullmatch(value.strip())
@@ -373,7 +384,7 @@ def _value(file: _File, value: Any, where: str, own: str, n: int | None) -> np.n
         array = array.T if tree.get("transpose", False) else array
     else:
         array = _numbers(value, where, own)
-    # MATLAB has no numbers and no vectors, only matrices
+    # MATLAB stores numbers and vectors as matrices
     array = array.reshape(-1) if array.size == max(array.shape, default=0) else array
     if unit in (None, own):
         return array
@@ -385,8 +396,10 @@ def _value(file: _File, value: Any, where: str, own: str, n: int | None) -> np.n
 
 
 def _section(tree: Any, where: str, accepted: _Keys, needed: Sequence[str] = ()) -> dict[str, Any]:
-    """A mapping with the needed keys and no others than the accepted ones, whose values have their
-    types.
+    """Check the keys of a mapping and the types of its values.
+
+    Raises ValueError if a needed key is missing, a key is not accepted, or a value has the wrong
+    type.
     """
     if not isinstance(tree, Mapping):
         got = "nothing" if tree is None else repr(tree)
@@ -408,10 +421,10 @@ def _section(tree: Any, where: str, accepted: _Keys, needed: Sequence[str] = ())
 
 
 def _numbers(value: Any, where: str, unit: str) -> np.ndarray:
-    """Numbers that stand in the sidecar."""
+    """Convert numbers that are written in the sidecar to an array."""
     try:
         array = np.asarray(value)
-    except ValueError:  # lists of different lengths
+    except ValueError:  # lists have different lengths
         array = np.asarray(None)
     if array.dtype.kind not in "iuf":
         raise ValueError(
@@ -422,7 +435,7 @@ def _numbers(value: Any, where: str, unit: str) -> np.ndarray:
 
 
 def _steps(tree: Mapping[str, Any], where: str, n: int | None) -> np.ndarray:
-    """Numbers in equal steps, as many as a dim of the samples has."""
+    """Numbers in equal steps, as many as the length of a dim of the samples."""
     other = sorted(set(tree) - {"first", "step", "unit"})
     if n is None or other:
         what = f"{other[0]} is given too" if other else "this key has no length of its own"
@@ -431,7 +444,7 @@ def _steps(tree: Mapping[str, Any], where: str, n: int | None) -> np.ndarray:
 
 
 def _choice(value: Any, where: str, accepted: Sequence[str] | Mapping[str, Any]) -> str:
-    """One of a few words."""
+    """Check that a value is one of the accepted words."""
     if not isinstance(value, str) or value not in accepted:
         got = "is missing" if value is None else f"has the value {value!r}"
         raise ValueError(f"{where} {got}{did_you_mean(str(value), accepted)}")
@@ -439,7 +452,7 @@ def _choice(value: Any, where: str, accepted: Sequence[str] | Mapping[str, Any])
 
 
 def _stream(array: np.ndarray) -> IO[bytes]:
-    """An array in memory as a file in the format .npy."""
+    """Write an array to a file in memory in the format .npy."""
     stream = io.BytesIO()
     np.save(stream, array, allow_pickle=False)
     stream.seek(0)
@@ -455,8 +468,10 @@ def _write(
     arrays: Mapping[str, np.ndarray],
     level: Level,
 ) -> None:
-    """Write the archive; the samples (slow, fast) are stored in the order of the file they come
-    from, which is turned where the slow dim is the second one of the array in the archive.
+    """Write the archive; the samples are stored in the order of the source file, (slow, fast).
+
+    `turned` says that the slow dim is the second one of the array in the archive. The array is then
+    stored in Fortran order.
     """
     with zipfile.ZipFile(path, "x") as archive:
         for name, array in arrays.items():

@@ -21,13 +21,13 @@ from torchsar.io.recorded import describe_stripmap
 from torchsar.io.seal import canonical, group_attributes, sealed
 from torchsar.repair.placing import LinePlan
 
-# number of the layout of the store; another one is refused
+# version number of the layout of the store; a store with another number is not read
 _FORMAT = 1
-# samples of a chunk along range, by choice: 8 MB as complex64 with the lines of a chunk
+# number of samples of a chunk along range, by choice: a chunk is 8 MB as complex64
 _CHUNK_SAMPLES = 4096
-# bytes of samples that are read at once from an image, by choice
+# number of bytes that are read from an image at once, by choice
 _PART_BYTES = 32 << 20
-# side data with one entry per line
+# names of side data with one entry per line
 _PER_LINE = ("agc_db", "line_number", "line_time_s", "window_start_m")
 
 
@@ -95,14 +95,16 @@ class StripRecording:
 
     @cached_property
     def _turns(self) -> float:
-        """Doppler centroid about which lines are interpolated, from lines in the middle."""
+        """Doppler centroid (cycles per line), about which lines are interpolated; estimated from
+        the middle lines.
+        """
         assert self._plan is not None
         n = len(self._plan.time)
         start, stop = max(0, n // 2 - 1024), min(n, n // 2 + 1024)
         return self._plan.doppler_turns(self._plan.aligned(self._recorded(start, stop).signal.data, start), start)
 
     def _recorded(self, first: int, last: int) -> Recording:
-        """Lines as they were recorded."""
+        """Read some of the lines as they were recorded."""
         aux = {name: x[first:last] if name in _PER_LINE else x for name, x in self._held.aux.items()}
         with naming(self.path):
             data = self._held.formed(self._held.samples.rows(first, last))
@@ -110,7 +112,7 @@ class StripRecording:
             return Recording.from_arrays(data, self.radar, dtype=self.dtype, start_s=start_s, what=what, **aux)
 
     def __getitem__(self, key: Any) -> torch.Tensor:
-        """Samples of some of the lines, key[-2], as `focus_strip` reads them."""
+        """Read the samples of the lines key[-2], for use by `focus_strip`."""
         return self.recording(key[-2].start, key[-2].stop).signal.data
 
 
@@ -165,7 +167,7 @@ class StripImage:
 
     @staticmethod
     def is_begun(path: str | Path) -> bool:
-        """Whether a store has finished blocks, so that it cannot simply be replaced.
+        """Check if a store has finished blocks, so that it must not simply be replaced.
 
         Args:
             path: Folder of the store, which may not exist, or be cut off while it was created.
@@ -213,7 +215,7 @@ class StripImage:
             shape=shape,
             dtype=str(dtype).removeprefix("torch."),
             chunks=(min(shape[0], chunk_lines), min(shape[1], _CHUNK_SAMPLES)),
-            compressors=[codecs.Crc32cCodec()],  # by which a damaged chunk is found
+            compressors=[codecs.Crc32cCodec()],  # detects a damaged chunk
             dimension_names=[axis.name for axis in axes],
             attributes={"unit": "1"},
         )
@@ -238,7 +240,7 @@ class StripImage:
                 )
 
     def is_finished(self, lines: slice) -> bool:
-        """Whether a block of image lines is finished."""
+        """Check if a block of image lines is finished."""
         return str(lines.start) in self._blocks
 
     def check(self, lines: slice, raw: int) -> None:
@@ -286,7 +288,8 @@ class StripImage:
             ValueError: If a chunk is damaged.
         """
         azimuth, range_ = self.axes
-        whole = math.lcm(multiple, self.array.chunks[0])  # so that no chunk is read twice
+        # number of lines with which no chunk is read twice
+        whole = math.lcm(multiple, self.array.chunks[0])
         step = max(1, _PART_BYTES // (multiple * range_.n * self.array.dtype.itemsize)) * multiple
         step -= step % whole if step >= whole else 0
         for first in range(0, azimuth.n, step):

@@ -19,9 +19,9 @@ from torchsar.radar.spotlight import frequency_step_hz
 
 _NAMESPACE = "http://api.nsgreg.nga.mil/schema/cphd/1.1.0"
 _CHANNEL = "1"
-# start of the collection where none is known
+# start of the collection in a file if it is not known
 UNKNOWN_START = datetime(1970, 1, 1, tzinfo=UTC)
-# samples per delay that the file declares as valid: the recommendation of the standard is 1.2
+# ratio of the unambiguous delays to the swath of delays in the file; the standard recommends 1.2
 _OVERSAMPLING = 1.25
 
 
@@ -76,7 +76,8 @@ def write_cphd(
     legs = [torch.linalg.vector_norm(place - point, dim=-1) for place in antennas.places]
     samples = frequency_samples(single(recording.signal.data, 2, "the signal").to(torch.complex128))
     longer = antennas.reference_m - (legs[0] + legs[-1])
-    if float(longer.abs().max()) > 1e-8:  # metres; the phases refer to another point
+    # limit in metres, above which the phases refer to another point
+    if float(longer.abs().max()) > 1e-8:
         samples = samples * unit_phasor(-longer[:, None] * frequency / LIGHT_M_S, samples.dtype)
     samples = samples.to(torch.complex64).numpy()
     half = LIGHT_M_S / (4 * frequency_step_hz(frequency) * _OVERSAMPLING)
@@ -91,7 +92,7 @@ def write_cphd(
     for name, value in vectors.items():
         packed[name] = value
     seen = sarkit.compute_t_ref_from_pvps(packed[[0, -1]])
-    root["Dwell"] = {  # all points of the scene are seen by all vectors
+    root["Dwell"] = {  # every vector contributes to all points of the scene
         "NumCODTimes": 1,
         "CODTime": [{"Identifier": _CHANNEL, "CODTimePoly": np.array([[seen.mean()]])}],
         "NumDwellTimes": 1,
@@ -99,7 +100,8 @@ def write_cphd(
     }
     dwell = root["Dwell"].elem
     tree.getroot().find("{*}PVP").addnext(dwell)
-    with np.errstate(invalid="ignore"):  # an antenna at rest has no cone angle, for which 90 degrees stand
+    # the cone angle of an antenna at rest is undefined, and the header has 90 degrees for it
+    with np.errstate(invalid="ignore"):
         dwell.addnext(sarkit.compute_reference_geometry(tree, packed))
 
     def write(part: Path) -> None:
@@ -113,7 +115,7 @@ def write_cphd(
 def _vectors(
     antennas: AntennaPath, legs: list[Tensor], frequency: Tensor, point: Tensor, time: Tensor, frame: LocalFrame
 ) -> dict[str, Any]:
-    """Parameters of the vectors by name, in the order of the schema."""
+    """Parameters of the vectors by name, in the order of the CPHD schema."""
     step = frequency_step_hz(frequency)
     swath = 1 / (_OVERSAMPLING * step)
     sent = (time - time[0] if float(time[0]) < 0 else time).numpy()
@@ -121,7 +123,7 @@ def _vectors(
     for side, index in (("Tx", 0), ("Rcv", -1)):
         clock = sent if side == "Tx" else sent + ((legs[0] + legs[-1]) / LIGHT_M_S).numpy()
         earth = frame.geocentric_m(antennas.places[index]).numpy()
-        # a single antenna has the same position at transmission and reception
+        # a single antenna has one position per pulse, at the time of transmission
         moved = sent if len(antennas.places) == 1 else clock
         speed = np.gradient(earth, moved, axis=0, edge_order=2 if len(moved) > 2 else 1)
         found |= {f"{side}Time": clock, f"{side}Pos": earth, f"{side}Vel": speed}
@@ -143,14 +145,15 @@ def _content(
     start: datetime,
     mode: str,
 ) -> dict[str, Any]:
-    """Content of the XML header by element, but for dwell and reference geometry.
+    """Entries of the XML header by element, without dwell and reference geometry.
 
-    corners: opposite corners of the imaged area in metres, (corner, 2).
+    corners: two opposite corners of the imaged area in metres, (corner, 2).
     """
     wgs84 = library("sarkit.wgs84", "formats", "geodetic coordinates")
     origin = frame.geocentric_m(torch.zeros(3, dtype=torch.float64))
     east, north, _ = (frame.geocentric_m(torch.eye(3, dtype=torch.float64)) - origin).numpy()
-    low, high = corners.amin(0).tolist(), corners.amax(0).tolist()  # west and south, east and north
+    # south-west and north-east corner
+    low, high = corners.amin(0).tolist(), corners.amax(0).tolist()
     ring = [low, (low[0], high[1]), high, (high[0], low[1])]
     edges = frame.geocentric_m(torch.tensor([[*point, 0.0] for point in ring], dtype=torch.float64)).numpy()
     sizes = [3 if np.ndim(value) == 2 else 1 for value in vectors.values()]
@@ -158,11 +161,13 @@ def _content(
     band, swath = vectors["FX2"] - vectors["FX1"], vectors["TOA2"] - vectors["TOA1"]
     fixed = bool((vectors["SRPPos"] == vectors["SRPPos"][0]).all())
     bistatic = {} if antennas.receiver_m is None else {"IlluminatorName": "transmitter"}
-    # grid of an image of the area with the spacing of the resolution, whose lines run east
+    # image grid of the area, whose spacing is the resolution and whose lines follow each other
+    # eastward
     spacing = LIGHT_M_S / (2 * band)
     counts = [max(1, math.ceil((high[i] - low[i]) / spacing)) for i in (0, 1)]
     grid = {
-        "IARPLocation": [round(-low[i] / spacing - 0.5) for i in (0, 1)],  # lines before the origin
+        # number of lines and samples before the origin
+        "IARPLocation": [round(-low[i] / spacing - 0.5) for i in (0, 1)],
         "IAXExtent": {"LineSpacing": spacing, "FirstLine": 0, "NumLines": counts[0]},
         "IAYExtent": {"SampleSpacing": spacing, "FirstSample": 0, "NumSamples": counts[1]},
     }

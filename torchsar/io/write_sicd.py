@@ -22,10 +22,10 @@ from torchsar.io.write_cphd import UNKNOWN_START
 from torchsar.radar import LIGHT_M_S, LocalFrame
 
 _NAMESPACE = "urn:SICD:1.4.0"
-# points along either axis at which spatial frequencies are fitted, and order of these polynomials,
-# by choice
+# _POINTS: number of points along each axis at which spatial frequencies are fitted, by choice
+# _ORDER: order of the fitted polynomials, by choice
 _POINTS, _ORDER = 7, 2
-# name of each window, and its width at -3 dB times bandwidth
+# for each window: its name in SICD, and its -3 dB width times the bandwidth
 _WINDOWS = {"none": ("UNIFORM", 0.885892941378905), "hann": ("HANNING", 1.4405)}
 
 
@@ -81,7 +81,7 @@ def write_sicd(
     root = sarkit.ElementWrapper(tree.getroot())
     root.from_dict(_content(scene, image.windows, wgs84, start, mode))
     known = sarkit.compute_scp_coa(tree)
-    for node in known.iter():  # an antenna at rest has no cone angle
+    for node in known.iter():  # an antenna at rest has no cone angle, and the library writes NaN
         if node.text == "nan" and etree.QName(node).localname == "DopplerConeAng":
             node.text = "90.0"
     root["SCPCOA"] = known
@@ -122,13 +122,13 @@ class _Pixels:
     turns: int = 0
 
     def turned(self) -> _Pixels:
-        """The same pixels in an order that is turned by a quarter."""
+        """Rotate the order of the same pixels by 90 degrees."""
         corner = self.corner_m + self.step_m * (self.counts[1] - 1) * self.right
         return _Pixels(corner, -self.right, self.down, (self.counts[1], self.counts[0]), self.step_m, self.turns + 1)
 
     @property
     def middle(self) -> tuple[int, int]:
-        """Row and column of the centre point."""
+        """Row and column of the scene centre point."""
         return self.counts[0] // 2, self.counts[1] // 2
 
     def at(self, row: Tensor | float, column: Tensor | float) -> Tensor:
@@ -138,7 +138,9 @@ class _Pixels:
 
 
 def _away_from(grid: ImageGrid, position_m: Tensor) -> _Pixels:
-    """Pixels of an image in the order in which rows point away from a position most directly."""
+    """Order of the pixels of an image in which the rows point away from a position most
+    directly.
+    """
     orders = [_Pixels(grid.origin_m, grid.axes[1], grid.axes[0], (grid.counts[1], grid.counts[0]), grid.step_m)]
     for _ in range(3):
         orders.append(orders[-1].turned())
@@ -167,7 +169,7 @@ class _Scene:
         self.time = time - time[0]
         self.pixels = _away_from(image.grid, torch.stack([place.mean(0) for place in self.antennas.places]).mean(0))
         self.scp_m = self.pixels.at(*self.pixels.middle)
-        # the corners are the first, the last and those between
+        # points from the first to the last row and column, so that the corners are included
         along = [torch.tensor(np.linspace(0, n - 1, _POINTS), dtype=torch.float64).round() for n in self.pixels.counts]
         rows, columns = (v.reshape(-1) for v in torch.meshgrid(*along, indexing="ij"))
         self.row_m, self.column_m = (
@@ -182,7 +184,7 @@ class _Scene:
         self.low, self.high = spatial_band(points, axes, self.antennas, self.frequency, edges)
 
     def samples(self, data: Tensor) -> np.ndarray:
-        """Samples (row, column) whose spectrum lies about zero."""
+        """Samples (row, column), shifted to baseband: their spectrum is centred about zero."""
         data = torch.rot90(data.T, self.pixels.turns)
         for dim, middle in enumerate((self.low[-1] + self.high[-1]) / 2):
             x = self.pixels.step_m * (torch.arange(data.shape[dim], dtype=torch.float64) - self.pixels.middle[dim])
@@ -191,14 +193,16 @@ class _Scene:
         return data.to(torch.complex64).contiguous().numpy()
 
     def direction(self, dim: int, window: str) -> dict[str, Any]:
-        """Parameters of rows (dim 0) or columns (dim 1), with frequencies in cycles per metre."""
+        """SICD parameters of the rows (dim 0) or of the columns (dim 1); frequencies are in cycles
+        per metre.
+        """
         low, high, nyquist = self.low[:, dim], self.high[:, dim], 0.5 / self.pixels.step_m
         middle, width = (low + high) / 2, min(float(high[-1] - low[-1]), 2 * nyquist)
         poly = self.fitted(middle[:-1] - middle[-1], 0.0)
         corners = [i * (_POINTS - 1) + j * (_POINTS - 1) * _POINTS for i in (0, 1) for j in (0, 1)]
         change = np.polynomial.polynomial.polyval2d(self.row_m.numpy(), self.column_m.numpy(), poly)[corners]
         limits = (float(change.min()) - width / 2, float(change.max()) + width / 2)
-        if max(-limits[0], limits[1]) > nyquist:  # the spectrum wraps around
+        if max(-limits[0], limits[1]) > nyquist:  # the spectrum is aliased
             limits = (-nyquist, nyquist)
         axis = (self.pixels.down, self.pixels.right)[dim]
         along = self.frame.geocentric_m(axis) - self.frame.geocentric_m(torch.zeros_like(axis))
@@ -218,7 +222,10 @@ class _Scene:
         }
 
     def fitted(self, values: Tensor, at_centre: float) -> np.ndarray:
-        """Polynomial of row and column in metres that fits the points and meets the centre."""
+        """Fit a polynomial of row and column in metres to values at the points.
+
+        At the centre point the polynomial has the value `at_centre`.
+        """
         powers = [(i, j) for i in range(_ORDER + 1) for j in range(_ORDER + 1) if 0 < i + j <= _ORDER]
         scale = float(torch.maximum(self.row_m.abs().max(), self.column_m.abs().max()).clamp_min(1e-9))
         terms = torch.stack([(self.row_m / scale) ** i * (self.column_m / scale) ** j for i, j in powers], -1)
@@ -230,21 +237,23 @@ class _Scene:
         return poly
 
     def time_poly(self) -> np.ndarray:
-        """Time of the middle of the aperture in seconds, by powers of row and column in metres."""
+        """Polynomial of row and column in metres for the time in seconds of the middle of the
+        aperture.
+        """
         times = self.time[self.lit].mean(-1)
         if bool((self.lit == self.lit[0]).all()):
             return np.array([[float(times[-1])]])
         return self.fitted(times[:-1], float(times[-1]))
 
     def positions(self) -> dict[str, Any]:
-        """Polynomials of the positions by name."""
+        """Polynomials of the antenna positions by their SICD names."""
         places = self.antennas.places
         if len(places) == 1:
             return {"ARPPoly": self._poly(self.time, places[0])}
         away = [place - self.scp_m for place in places]
         ranges = [torch.linalg.vector_norm(v, dim=-1, keepdim=True) for v in away]
         middle = away[0] / ranges[0] + away[1] / ranges[1]
-        # on the bisector, at the mean range
+        # position on the bisector of both antenna directions, at their mean range
         bisector = self.scp_m + (ranges[0] + ranges[1]) / 2 * middle / torch.linalg.vector_norm(
             middle, dim=-1, keepdim=True
         )
@@ -257,8 +266,9 @@ class _Scene:
         }
 
     def _poly(self, time: Tensor, position: Tensor) -> np.ndarray:
-        """Polynomial of time in seconds through geocentric positions, (power, 3); of order 9 at
-        most, and the lowest with an rms distance of 0.1 mm or less, by choice.
+        """Fit a polynomial of time in seconds to geocentric positions, (power, 3).
+
+        Its order is the lowest with an rms distance of at most 0.1 mm, and at most 9, by choice.
         """
         t, earth = time.numpy(), self.frame.geocentric_m(position).numpy()
         found = np.zeros((1, 3))
@@ -266,7 +276,7 @@ class _Scene:
             fits = [np.polynomial.Polynomial.fit(t, earth[:, axis], order) for axis in range(3)]
             found = np.zeros((order + 1, 3))
             for axis, coefficients in enumerate(fit.convert().coef for fit in fits):
-                found[: len(coefficients), axis] = coefficients  # trailing zeros are left out
+                found[: len(coefficients), axis] = coefficients  # the library omits trailing zeros
             error = np.stack([fit(t) for fit in fits], -1) - earth
             if np.sqrt((error**2).sum(-1).mean()) <= 1e-4:
                 break
@@ -274,8 +284,9 @@ class _Scene:
 
 
 def _content(scene: _Scene, windows: Sequence[str], wgs84: Any, start: datetime, mode: str) -> dict[str, Any]:
-    """Content of the XML by element, but for SCPCOA; windows along azimuth and along range, which
-    rows follow.
+    """Entries of the XML by element, without SCPCOA.
+
+    windows: names of the windows along azimuth and along range.
     """
     pixels, frame, antennas = scene.pixels, scene.frame, scene.antennas
     rows, columns = pixels.counts
