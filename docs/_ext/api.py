@@ -20,6 +20,7 @@ from docutils import nodes
 from sphinx.addnodes import pending_xref
 from sphinx.application import Sphinx
 from sphinx.environment import BuildEnvironment
+from sphinx.util.docutils import SphinxDirective
 
 # packages in the order in which they build on each other
 PACKAGES = (
@@ -182,8 +183,26 @@ def missing(app: Sphinx, env: BuildEnvironment, node: pending_xref, content: nod
     return content if in_docstring and node.get("refdomain") == "py" else None
 
 
+class Derivatives(SphinxDirective):
+    """Table of the stages and functions whose attribute `differentiable` is not "yes"."""
+
+    def run(self) -> list[nodes.Node]:
+        named: dict[str, list[str]] = {"where ok": [], "no": []}
+        for qualified in itertools.chain(*names().values()):
+            face, name = split(qualified)
+            kind = getattr(getattr(face, name), "differentiable", "yes")
+            if kind in named:
+                named[kind].append(f"`~{qualified}`")
+        lines = [".. list-table::", "   :header-rows: 1", "", "   * - Derivatives", "     - Stages and functions"]
+        for kind, found in named.items():
+            lines += [f"   * - {kind}", f"     - {', '.join(found)}"]
+        lines += ["   * - yes", "     - all others that work on samples or numbers"]
+        return self.parse_text_to_nodes("\n".join(lines))
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Register the pages, the docstrings, and what becomes of unknown names."""
+    """Register the pages, the docstrings, the table of derivatives, and the unknown names."""
+    app.add_directive("derivatives", Derivatives)
     app.connect("builder-inited", write)
     app.connect("autodoc-process-docstring", describe, priority=400)
     app.connect("missing-reference", missing)

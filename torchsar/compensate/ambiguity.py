@@ -247,6 +247,7 @@ class DopplerCentroid(Stage):
     """
 
     provides = ("doppler_hz", "doppler_baseband_hz", "ambiguity", "squint_deg")
+    differentiable = "no"
 
     def __init__(
         self,

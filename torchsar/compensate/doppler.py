@@ -24,6 +24,7 @@ from torchsar.core import (
     Signal,
     Stage,
     checked_samples,
+    differentiable,
     fft_lines,
     power_of,
     unit_level,
@@ -78,6 +79,7 @@ def lag_products(x: Tensor, blocks: tuple[int, int] = (8, 8)) -> tuple[Tensor, T
     return torch.stack(products, -2), torch.stack(powers, -2)
 
 
+@differentiable("where ok")
 def phase_increment(
     x: Tensor,
     prf_hz: float,
@@ -138,6 +140,7 @@ def phase_increment(
     return doppler_assess.baseband(found, doppler_assess.Increments.of(x, products, power, prf_hz, rate_hz_s, dwell_s))
 
 
+@differentiable("where ok")
 def energy_centre(
     x: Tensor,
     prf_hz: float,
@@ -236,6 +239,7 @@ class _Baseband(Stage):
     provides = ("doppler_baseband_hz",)
     # function of lines, PRF, blocks, rate, dwell
     find: Callable[..., Estimate]
+    differentiable = "where ok"
 
     def __init__(self, radar: StripmapRadar, blocks: tuple[int, int] = (8, 8), assess: bool = True) -> None:
         super().__init__()
@@ -280,6 +284,7 @@ class EnergyCentre(_Baseband):
     find = staticmethod(energy_centre)
 
 
+@differentiable("where ok")
 def point_doppler(
     x: Tensor, prf_hz: float, rate_hz_s: Tensor | float = 0.0, centre_hz: Tensor | float = 0.0, rounds: int = 6
 ) -> Tensor:

@@ -37,6 +37,7 @@ from torchsar.core import (
     Stage,
     block_bytes_of,
     checked_samples,
+    differentiable,
     linear_phasor,
     refuse_non_finite,
 )
@@ -83,7 +84,7 @@ def shift_range(data: Tensor, shift_cells: Tensor | float) -> Tensor:
     return torch.fft.ifft(torch.fft.fft(data) * phasor)
 
 
-@torch.no_grad()
+@differentiable("no")
 def align_envelopes(
     data: Tensor,
     *,
@@ -204,6 +205,7 @@ class AlignEnvelopes(Stage):
 
     provides = ("shift_m", "velocity_m_s")
     neutral = {"shift_m": 0.0, "velocity_m_s": 0.0}
+    differentiable = "no"
 
     def __init__(
         self,

@@ -187,6 +187,7 @@ class PointDoppler(Stage):
 
     works_on = ("azimuth", "range")
     provides = ("doppler_hz", "doppler_baseband_hz")
+    differentiable = "no"
 
     def __init__(self, radar: StripmapRadar, crossing_s: float | None = None, assess: bool = True) -> None:
         super().__init__()

@@ -31,6 +31,7 @@ from torchsar.core import (
     Signal,
     Stage,
     checked_samples,
+    differentiable,
     fft_lines,
     settle,
     take,
@@ -114,6 +115,7 @@ def grid_step_m_s(radar: StripmapRadar, range_m: float, dwell_s: float) -> float
     return 2 * radar.wavelength_m * range_m / (radar.velocity_m_s * dwell_s**2)
 
 
+@differentiable("no")
 def minimum_entropy_velocity(
     group: RangeGroup,
     doppler_hz: Tensor,
@@ -278,6 +280,7 @@ class EffectiveVelocity(Stage):
 
     provides = ("velocity_m_s",)
     takes_empty = False
+    differentiable = "no"
 
     def __init__(
         self,

@@ -24,6 +24,7 @@ power, very large or small samples       `power_of`, `unit_level`, `level_of`
 checks in a function of your own         `checked_samples`, `refuse_non_finite`, `check_value`;
                                          `gathered_checks` and `host_value` on an accelerator
 whether a device can compute             `device_fault`
+a derivative that does not exist         `DerivativeWarning`
 =======================================  ==========================================================
 """
 
@@ -31,6 +32,7 @@ from torchsar.core import trees as trees  # registers signals and estimates with
 from torchsar.core.alternate import Alternate, Turn
 from torchsar.core.chain import Chain, Trace
 from torchsar.core.connect import Use, use
+from torchsar.core.derivatives import DerivativeWarning, differentiable
 from torchsar.core.draws import Draws, Source
 from torchsar.core.estimate import Estimate, Outcome, counts, settle, worst
 from torchsar.core.fft import (
@@ -83,6 +85,7 @@ __all__ = [
     "Alternate",
     "Axis",
     "Chain",
+    "DerivativeWarning",
     "Draws",
     "Estimate",
     "Outcome",

@@ -74,6 +74,8 @@ class Alternate(Stage):
             value that its own estimator does not provide.
     """
 
+    differentiable = "where ok"
+
     def __init__(self, rounds: int = 3, **turns: Turn) -> None:
         super().__init__()
         for name, turn in turns.items():

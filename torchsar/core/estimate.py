@@ -171,7 +171,8 @@ class Estimate(Shown):
         value: Estimated values by name. Names end in the unit, such as `doppler_hz` of shape (...,)
             or `phase_rad` of shape (..., pulse). Finite in all trials.
         std: Predicted standard deviations, with the names, shapes and units of the values; only for
-            those values whose standard deviation theory predicts.
+            those values whose standard deviation theory predicts. Derivatives belong to the values:
+            `std` and `quality` are constant for them.
         quality: Quality from 0 (unusable) to 1, shape (...,); each estimator defines how it is
             measured. By default 1 where the estimate is ok, and 0 elsewhere.
         outcome: Code of an `Outcome` in each trial, shape (...,), integer; where there are several
@@ -218,6 +219,8 @@ class Estimate(Shown):
                 f"`quality`, got `outcome` of {self.outcome.dtype} with shape {tuple(self.outcome.shape)} and "
                 f"`quality` with shape {tuple(self.quality.shape)}; Outcome.of(ok, otherwise) makes it from bools"
             )
+        object.__setattr__(self, "std", {name: x.detach() for name, x in self.std.items()})
+        object.__setattr__(self, "quality", self.quality.detach())
         for name, x in self.std.items():
             if name not in self.value or x.shape != self.value[name].shape:
                 raise ValueError(

@@ -6,6 +6,7 @@ import functools
 import inspect
 import textwrap
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from torchsar.core.derivatives import Differentiable, without_derivatives
 from torchsar.core.estimate import Estimate
 from torchsar.core.host import checked_samples, gathered_checks, refuse_non_finite_values
 from torchsar.core.signal import Signal
@@ -45,6 +47,9 @@ class Stage(nn.Module):
     - `takes_real`: True if it also accepts the real samples of a one-channel detector.
     - `fixed`: names of values on whose numbers the plan of the computation depends. torch.compile
       makes constants of them, and the program raises RuntimeError if they change.
+    - `differentiable`: "yes"; "where ok", for an estimator whose value has derivatives in trials in
+      which it is reliable; or "no": it computes with constants, and gives a `DerivativeWarning` if
+      its input has a gradient.
     - `takes_empty`: False if it refuses a batch without trials. Otherwise the result is empty, or a
       function that it calls refuses the batch.
 
@@ -68,6 +73,7 @@ class Stage(nn.Module):
     takes_real: bool = False
     takes_empty: bool = True
     fixed: tuple[str, ...] = ()
+    differentiable: Differentiable = "yes"
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -97,7 +103,10 @@ class Stage(nn.Module):
             )
         data = checked_samples(signal.data, name, ", ".join(signal.names), real=self.takes_real, empty=self.takes_empty)
         refuse_non_finite_values(name, **{f"argument {i}": value for i, value in enumerate(args, 2)}, **values)
-        result = super().__call__(signal if data is signal.data else signal.with_data(data), *args, **values)
+        given: Any = (signal if data is signal.data else signal.with_data(data), *args), values
+        constant = self.differentiable == "no"
+        with without_derivatives(name, given) if constant else nullcontext(given) as (args, values):
+            result = super().__call__(*args, **values)
         if isinstance(result, Estimate):
             return self._with_neutral(result, values)
         if isinstance(result, tuple) and isinstance(result[-1], Estimate):

@@ -127,7 +127,7 @@ def to_db(power_: Tensor, floor_db: float = -120.0, reference: Tensor | None = N
     if not isinstance(power_, Tensor) or not power_.is_floating_point() or power_.ndim < 2 or not power_.numel():
         got = f"{power_.dtype} of shape {tuple(power_.shape)}" if isinstance(power_, Tensor) else type(power_).__name__
         raise ValueError(f"to_db converts real power (..., azimuth, range) with at least one sample, got {got}")
-    top = power_.detach().amax((-2, -1)) if reference is None else reference
+    top = power_.amax((-2, -1)) if reference is None else reference
     top = top[..., None, None]
     ratio = power_ / torch.where(top > 0, top, 1)
     return 10 * torch.log10(ratio.clamp_min(10 ** (floor_db / 10)))

@@ -25,6 +25,7 @@ from torchsar.core import (
     Outcome,
     Signal,
     Stage,
+    differentiable,
     fft_lines,
     refuse_non_finite_values,
     unit_level,
@@ -117,6 +118,7 @@ def without_errors(
     return data * factor
 
 
+@differentiable("no")
 def estimate_balance(
     data: Tensor,
     radar: BistaticRadar,
@@ -320,6 +322,7 @@ class EstimateBalance(Stage):
     works_on = ("channel", "pulse", "range")
     provides = ("phase_rad", "gain_db", "delay_s")
     neutral = {"phase_rad": 0.0, "gain_db": 0.0, "delay_s": 0.0}
+    differentiable = "no"
 
     def __init__(
         self,

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from torchsar.core import Signal, checked_samples, unit_level
+from torchsar.core import Signal, checked_samples, differentiable, unit_level
 
 
 @dataclass(frozen=True)
@@ -66,6 +66,7 @@ def contrast(image: Signal, extent_m: tuple[float, float] = (60.0, 10.0)) -> tup
     return mean / typical[..., None, None], (middles[0], middles[1])
 
 
+@differentiable("no")
 def detect(
     image: Signal,
     threshold_db: float = 10.0,

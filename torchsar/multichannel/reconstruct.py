@@ -27,6 +27,7 @@ from torch import Tensor
 from torchsar.core import (
     Axis,
     Signal,
+    differentiable,
     fft_lines,
     host_largest,
     host_value,
@@ -197,6 +198,7 @@ def largest_condition(dtype: torch.dtype) -> float:
     return 1e6 if dtype == torch.complex128 else 1e4
 
 
+@differentiable("no")
 def condition_number(radar: BistaticRadar, motion: PointMotion, bands: int) -> Tensor:
     """Return the condition number of the matrix of channel responses to the Doppler bands.
 

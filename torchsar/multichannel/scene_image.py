@@ -151,6 +151,7 @@ class ImageMovers(Stage):
     """
 
     works_on = ("channel", "pulse", "range")
+    differentiable = "no"
 
     def __init__(
         self,
@@ -431,6 +432,7 @@ class MoversImage(Stage):
 
     works_on = ("channel", "pulse", "range")
     provides = ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")
+    differentiable = "no"
 
     def __init__(
         self,

@@ -274,6 +274,7 @@ class EstimateSynchronisation(ChannelStage):
     provides = ("phase_rad", "delay_s")
     neutral = {"phase_rad": 0.0, "delay_s": 0.0}
     takes_empty = False
+    differentiable = "no"
 
     def __init__(self, radar: BistaticRadar, *, assess: bool = True) -> None:
         super().__init__(radar)
@@ -328,6 +329,7 @@ class ClutterSynchronisation(Stage):
     works_on = ("channel", "pulse", "range")
     provides = ("phase_rad",)
     neutral = {"phase_rad": 0.0}
+    differentiable = "no"
 
     def __init__(
         self, radar: BistaticRadar, band_hz: float, block_s: float = 0.25, snr_db: float = 30.0, *, assess: bool = True

@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torchsar.core import differentiable
+
 # maps points (..., n) to costs (...,), with with_gradient=True also to gradients (..., n)
 Objective = Callable[[Tensor], Any]
 
@@ -53,6 +55,7 @@ class Descent:
     ok: Tensor
 
 
+@differentiable("no")
 def lbfgs(
     objective: Objective,
     start: Tensor,
@@ -147,6 +150,7 @@ def lbfgs(
     return Descent(state.x, state.cost, gradient_norm, state.steps, state.evaluations, state.converged, state.ok)
 
 
+@differentiable("no")
 def adam(
     objective: Objective,
     start: Tensor,

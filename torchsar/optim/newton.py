@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchsar.core import differentiable
 from torchsar.optim.descent import (
     SUFFICIENT,
     Descent,
@@ -19,6 +20,7 @@ from torchsar.optim.descent import (
 )
 
 
+@differentiable("no")
 def newton(
     objective: Objective,
     start: Tensor,

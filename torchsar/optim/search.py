@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import Draws, take
+from torchsar.core import Draws, differentiable, take
 
 # objective of a population: maps candidates (..., candidate, n) to costs (..., candidate)
 Population = Callable[[Tensor], Tensor]
@@ -43,6 +43,7 @@ class Searched:
     ok: Tensor
 
 
+@differentiable("no")
 def grid_search(
     objective: Population,
     axes: Sequence[Tensor],
@@ -98,6 +99,7 @@ def grid_search(
     return Searched(x, least, evaluations, costs.unflatten(-1, sizes), torch.isfinite(least))
 
 
+@differentiable("no")
 def genetic(
     objective: Population,
     low: Tensor,
@@ -219,6 +221,7 @@ def genetic(
     return _found(x, cost, history, population + generations * brood)
 
 
+@differentiable("no")
 def differential_evolution(
     objective: Population,
     low: Tensor,

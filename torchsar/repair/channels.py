@@ -21,6 +21,7 @@ from torchsar.core import (
     Stage,
     checked_samples,
     cis,
+    differentiable,
     real_dtype,
     refuse_non_finite_values,
     take,
@@ -92,6 +93,7 @@ def _looks(x: Tensor, channels: int) -> int:
     return (2 * (x.shape[-1] // 32) + 1) * (x.shape[-2] // channels)
 
 
+@differentiable("where ok")
 def estimate_imbalance(
     x: Tensor, channels: int = 2, doppler_cycles: Tensor | float | None = None, *, assess: bool = True
 ) -> Estimate:
@@ -220,6 +222,7 @@ class EstimateImbalance(Stage):
 
     provides = ("gain", "phase_rad")
     neutral = {"gain": 1.0, "phase_rad": 0.0}
+    differentiable = "where ok"
 
     def __init__(self, channels: int = 2, *, assess: bool = True) -> None:
         super().__init__()

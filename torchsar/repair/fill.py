@@ -142,7 +142,7 @@ def band_limited_fill(lines: Tensor, missing: Tensor, rounds: int = 2, steps: in
     Conjugate gradients find the missing lines that minimise the sum of |D(f)|^2 / S(f) over the
     azimuth frequencies f, where D is the azimuth spectrum of all lines and S the expected power
     spectrum. S includes the Doppler centroid; it is estimated first from the received lines, then
-    from the filled ones. Differentiable in the received lines, with S held fixed.
+    from the filled ones. Differentiable in the received lines.
 
     Args:
         lines: Lines, shape (..., pulse, range), complex.
@@ -164,16 +164,14 @@ def band_limited_fill(lines: Tensor, missing: Tensor, rounds: int = 2, steps: in
     filled = zero_fill(lines, missing).mT.contiguous()
     level = level_of(filled)
     filled = filled / level
-    spectrum = azimuth_spectrum(filled.detach(), ~mask.expand(filled.shape)[..., 0, :]).clamp_min(0.05)
+    spectrum = azimuth_spectrum(filled, ~mask.expand(filled.shape)[..., 0, :]).clamp_min(0.05)
     for _ in range(rounds):
 
         def precision(x: Tensor, weight: Tensor = (1 / spectrum)[..., None, :]) -> Tensor:
             return torch.where(mask, torch.fft.ifft(torch.fft.fft(x) * weight), 0)
 
         filled = conjugate_fill(precision, filled, -precision(filled), steps)
-        spectrum = azimuth_spectrum(
-            filled.detach(), torch.ones_like(filled[..., 0, :], dtype=torch.bool), 96
-        ).clamp_min(2e-3)
+        spectrum = azimuth_spectrum(filled, torch.ones_like(filled[..., 0, :], dtype=torch.bool), 96).clamp_min(2e-3)
     return torch.where(mask.mT, (filled * level).mT, lines)
 
 

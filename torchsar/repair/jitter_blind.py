@@ -22,7 +22,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Outcome, Signal, Stage, checked_samples, unit_level
+from torchsar.core import Estimate, Outcome, Signal, Stage, checked_samples, differentiable, unit_level
 from torchsar.repair.assess import assess_offsets, of_trials
 from torchsar.repair.jitter import MIN_GAP, correct_jitter_exact, smallest_gap, uncrossed
 
@@ -184,6 +184,7 @@ def detect_jitter_period(y: Tensor, max_period: int = 16) -> Tensor:
     return torch.stack(explained).argmax(0) + 1
 
 
+@differentiable("no")
 def estimate_jitter_blind(
     y: Tensor, max_period: int = 16, period: int | None = None, passes: int = 12, *, assess: bool = True
 ) -> Estimate:
@@ -340,6 +341,7 @@ class BlindJitter(Stage):
 
     provides = ("offset_samples", "period")
     neutral = {"offset_samples": 0.0, "period": 1}
+    differentiable = "no"
 
     def __init__(self, max_period: int = 16, period: int | None = None, *, assess: bool = True) -> None:
         super().__init__()

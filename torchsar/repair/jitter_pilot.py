@@ -16,11 +16,22 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Outcome, Signal, Stage, checked_samples, linear_phasor, take, unit_level
+from torchsar.core import (
+    Estimate,
+    Outcome,
+    Signal,
+    Stage,
+    checked_samples,
+    differentiable,
+    linear_phasor,
+    take,
+    unit_level,
+)
 from torchsar.repair.assess import assess_offsets
 from torchsar.repair.jitter import uncrossed
 
 
+@differentiable("where ok")
 def estimate_jitter_pilot(
     pilot: Tensor, max_period: int = 16, period: int | None = None, origin: str = "mean", *, assess: bool = True
 ) -> Estimate:
@@ -173,6 +184,7 @@ class PilotJitter(Stage):
 
     provides = ("offset_samples", "period")
     neutral = {"offset_samples": 0.0, "period": 1}
+    differentiable = "where ok"
 
     def __init__(
         self, max_period: int = 16, period: int | None = None, origin: str = "mean", *, assess: bool = True

@@ -21,7 +21,18 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Outcome, Signal, Stage, checked_samples, cis, linear_phasor, power_of, unit_level
+from torchsar.core import (
+    Estimate,
+    Outcome,
+    Signal,
+    Stage,
+    checked_samples,
+    cis,
+    differentiable,
+    linear_phasor,
+    power_of,
+    unit_level,
+)
 from torchsar.optim import lbfgs
 from torchsar.radar import StripmapRadar
 from torchsar.repair.assess import assess_response, of_trials
@@ -227,6 +238,7 @@ def sharpest_coefficients(
     return c
 
 
+@differentiable("no")
 def estimate_response_sharpest(
     image: Tensor,
     band: float,
@@ -396,6 +408,7 @@ def _align(spectra: Tensor, reference: Tensor) -> Tensor:
     return spectra * linear_phasor(-slope[..., 0], 0, spectra.shape[-1], spectra.dtype) * constant
 
 
+@differentiable("no")
 def estimate_response_points(
     image: Tensor,
     band: float,
@@ -491,6 +504,7 @@ class EstimateResponse(Stage):
     works_on = ("azimuth", "range")
     provides = ("phase_rad", "amplitude")
     neutral = {"phase_rad": 0.0, "amplitude": 1.0}
+    differentiable = "no"
 
     expected_power: Tensor | None
 

@@ -293,12 +293,12 @@ class SubLooks:
         smoothed = self.scene.in_blocks(images, _spaced(spectra.real, shape), -2)
         means = smoothed.mean((-2, -1), keepdim=True)
         own_mean, mean = means[:-1], means[-1]
-        floor = torch.maximum(unexplained, 1e-9 * mean + torch.finfo(mean.dtype).tiny)
+        floor = torch.maximum(unexplained, 1e-9 * mean)
 
         def local(columns: slice) -> Tensor:
             both = smooth(smoothed[..., columns], 1.0, -2, False)
             expected = own_mean * (both[-1] / torch.where(mean > 0, mean, 1))
-            return torch.sqrt(both[:-1] * expected) + floor
+            return torch.sqrt((both[:-1] * expected).clamp_min(torch.finfo(mean.dtype).tiny)) + floor
 
         return self.scene.in_blocks(local, torch.empty_like(smoothed[:-1]), -1)
 
@@ -406,7 +406,7 @@ def sparse_fill(
     for scenes of points; four or more are useful for speckle that fills the PRF band. More than two
     rounds or two steps are useful only in long gaps. With the default values and 1 % of the lines
     missing, the FFTs of the computation are those of about 65 two-dimensional ones. Received lines
-    are kept bit for bit. Differentiable in the lines, with thresholds and local powers held fixed.
+    are kept bit for bit. Differentiable in the lines.
 
     Args:
         lines: Lines, shape (..., pulse, range), complex.
@@ -445,12 +445,11 @@ def sparse_fill(
     scene = IncompleteLines(operator, x, mask)
     model = SubLooks(scene, look_windows(x.shape[-2], looks, turns.expand(x.shape[:-2])))
     missing_share = mask.to(x.real.dtype).mean(-1)[..., None, None]
-    unexplained = 0.5 * missing_share * power_of(x.detach()).mean((-2, -1), keepdim=True)
+    unexplained = 0.5 * missing_share * power_of(x).mean((-2, -1), keepdim=True)
     found = bright_fill(scene)
     for _ in range(rounds):
-        with torch.no_grad():
-            power = model.power(found, unexplained)
-            inverse = 1 / power
+        power = model.power(found, unexplained)
+        inverse = 1 / power
         weight = power.mean((0, -2, -1), keepdim=True) * inverse
         residual = -model.precision(found, weight, received=True)
         found = conjugate_fill(lambda y, w=weight: model.precision(y, w), found, residual, steps)

@@ -36,7 +36,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Outcome, checked_samples, real_dtype, take, unit_level, unit_phasor
+from torchsar.core import Estimate, Outcome, checked_samples, differentiable, real_dtype, take, unit_level, unit_phasor
 from torchsar.radar import TriangularLadar
 from torchsar.repair.analytic import delayed
 from torchsar.repair.assess import assess_trigger
@@ -89,6 +89,7 @@ class _Windows:
         return source.gather(-1, index.expand(*source.shape[:-1], j.numel() * n)).unflatten(-1, (j.numel(), n))
 
 
+@differentiable("where ok")
 def find_trigger(
     record: Tensor,
     radar: TriangularLadar,

@@ -20,11 +20,12 @@ from torchsar.compensate.path.ground import FINE_STEP, for_each, ground_image, n
 from torchsar.compensate.path.joint import three_axes
 from torchsar.compensate.path.search import Search, found_from_starts
 from torchsar.compensate.pulse_phase.recommended import autofocus
-from torchsar.core import Estimate, Outcome, Signal, Stage
+from torchsar.core import Estimate, Outcome, Signal, Stage, differentiable
 from torchsar.metrics import entropy
 from torchsar.radar import AntennaPath
 
 
+@differentiable("no")
 def path_autofocus(
     profiles: Tensor,
     frequency_hz: Tensor,
@@ -171,6 +172,7 @@ def _spread(found: Estimate, present: Tensor) -> Estimate:
     return replace(found, value=value, std=std)
 
 
+@differentiable("no")
 def path_phase(
     profiles: Tensor,
     frequency_hz: Tensor,
@@ -240,6 +242,7 @@ class _PathEstimator(Stage):
         settings: Options of the function `find` of the stage.
     """
 
+    differentiable = "no"
     # function of profiles, frequencies, antennas and its own settings
     find: Callable[..., Estimate]
 

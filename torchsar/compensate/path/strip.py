@@ -16,7 +16,7 @@ from torchsar.compensate.path.joint import cosines, expected_power
 from torchsar.compensate.path.line_of_sight import _PathEstimator
 from torchsar.compensate.path.scatterers import Echoes, prominent_places
 from torchsar.compensate.pulse_phase.data import or_one, without_line
-from torchsar.core import Estimate, Outcome, cis
+from torchsar.core import Estimate, Outcome, cis, differentiable
 from torchsar.focus import ImageGrid, ProcessedBeam, TilePlan
 from torchsar.focus.image_grid import level_plane
 from torchsar.focus.spotlight import window_weights
@@ -24,6 +24,7 @@ from torchsar.radar import LIGHT_M_S, AntennaPath, StraightTrack
 from torchsar.radar.spotlight import frequency_samples
 
 
+@differentiable("no")
 def strip_autofocus(
     profiles: Tensor,
     frequency_hz: Tensor,

@@ -26,11 +26,12 @@ from torchsar.compensate.pulse_phase.likelihood import (
 )
 from torchsar.compensate.pulse_phase.linking_assess import Judged, judged, outcome_of
 from torchsar.compensate.pulse_phase.stages import _PhaseEstimatorFromStart
-from torchsar.core import Estimate, Outcome, cis
+from torchsar.core import Estimate, Outcome, cis, differentiable
 
 _BLOCK_BYTES = 64 << 20  # limits the memory of a block of trials
 
 
+@differentiable("no")
 def link_phases(data: Tensor, *, start: Tensor | None = None, assess: bool = True) -> Estimate:
     """Estimate the phase of each pulse of a homogeneous scene by maximum likelihood.
 
@@ -88,6 +89,8 @@ class LinkPhases(_PhaseEstimatorFromStart):
     Args:
         assess: Whether to add the standard deviation and the outcome.
     """
+
+    differentiable = "no"
 
     def __init__(self, assess: bool = True) -> None:
         super().__init__(link_phases, assess=assess)

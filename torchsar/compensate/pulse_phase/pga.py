@@ -33,7 +33,7 @@ from torchsar.compensate.pulse_phase.data import (
     without_line,
 )
 from torchsar.compensate.pulse_phase.stages import _PhaseEstimator, _PhaseEstimatorFromStart
-from torchsar.core import Estimate, power_of, unit_phasor
+from torchsar.core import Estimate, differentiable, power_of, unit_phasor
 from torchsar.optim.scalar import vertex
 
 Kernel = Literal["lumv", "ml", "synchronised", "eigenvector"]
@@ -41,6 +41,7 @@ Windows = Literal["shrinking", "measured"] | Sequence[float]
 _PADDING = 2  # zero-padding of the pulses; the docstring of this module gives the reason
 
 
+@differentiable("where ok")
 def pga(
     data: Tensor,
     *,
@@ -111,6 +112,7 @@ def pga(
     return conclude(pulses, *find_phases(pulses, find, starting_phase(start, pulses, "pga")), assess)
 
 
+@differentiable("where ok")
 def pga_sca(
     data: Tensor,
     *,
@@ -161,6 +163,7 @@ def pga_sca(
     return conclude(pulses, *find_phases(pulses, find), assess)
 
 
+@differentiable("where ok")
 def sca(data: Tensor, *, assess: bool = True) -> Estimate:
     r"""Estimate the phase of each pulse from the products of adjacent pulses.
 
@@ -417,7 +420,10 @@ class View:
         g, padded = self.pulses(cells), self.image.shape[-1]
         k = torch.arange(g.shape[-1], dtype=torch.float64, device=g.device)
         low, top, high = (
-            self.power.gather(-1, torch.remainder(self.peak[..., None] + d, padded))[..., 0].sqrt() for d in (-1, 0, 1)
+            power_of(self.image.gather(-1, torch.remainder(self.peak[..., None] + d, padded)))[..., 0]
+            .clamp_min(torch.finfo(self.power.dtype).tiny)  # where the derivative of the root is finite
+            .sqrt()
+            for d in (-1, 0, 1)
         )
         turns = -(vertex(low, top, high).clamp(-0.5, 0.5) / padded)[..., None].double() * k
         return g * unit_phasor(turns, g.dtype) * self.present[:, None, :]

@@ -35,7 +35,7 @@ from torchsar.compensate.pulse_phase.imaging import AlongPulses, Imaging, Throug
 from torchsar.compensate.pulse_phase.linking import link_phases, linked
 from torchsar.compensate.pulse_phase.points import phases_of_points
 from torchsar.compensate.pulse_phase.stages import _PhaseEstimatorFromStart
-from torchsar.core import Estimate, Signal, fft_lines, host_value, power_of, true_positions
+from torchsar.core import Estimate, Signal, differentiable, fft_lines, host_value, power_of, true_positions
 from torchsar.focus import TargetImage
 from torchsar.metrics import entropy
 
@@ -51,6 +51,7 @@ _RELAXATION = 1.8
 _FILLING = 5
 
 
+@differentiable("where ok")
 def autofocus(
     data: Tensor,
     *,
@@ -200,6 +201,7 @@ def autofocus(
     return _with_linked(pulses, sharpest, assess) if scene == "auto" and through is None else sharpest
 
 
+@differentiable("where ok")
 def entropy_fixed_point(
     data: Tensor,
     *,

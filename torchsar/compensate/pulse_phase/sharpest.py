@@ -26,7 +26,7 @@ from torchsar.compensate.pulse_phase.data import (
 from torchsar.compensate.pulse_phase.fixed_point import LogAbove, Run, fixed_point
 from torchsar.compensate.pulse_phase.imaging import AlongPulses, Imaging, Through
 from torchsar.compensate.pulse_phase.stages import _PhaseEstimatorFromStart
-from torchsar.core import Estimate, centred_ifft, cis
+from torchsar.core import Estimate, centred_ifft, cis, differentiable
 from torchsar.metrics.image import contrast, entropy
 from torchsar.optim import adam, lbfgs
 
@@ -38,6 +38,7 @@ Method = Literal["lbfgs", "adam"]
 _PhaseCost = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
+@differentiable("no")
 def sharpest_phase(
     data: Tensor,
     *,
@@ -175,6 +176,8 @@ class SharpestPhase(_PhaseEstimatorFromStart):
         steps: Largest number of steps.
         assess: Whether to add the standard deviation and the outcome.
     """
+
+    differentiable = "no"
 
     def __init__(
         self,

@@ -76,6 +76,7 @@ class _PhaseEstimator(Stage):
 
     provides = ("phase_rad",)
     neutral = {"phase_rad": 0.0}
+    differentiable = "where ok"
 
     def __init__(self, find: Callable[..., Estimate], **options: Any) -> None:
         super().__init__()

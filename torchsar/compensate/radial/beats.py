@@ -19,11 +19,13 @@ from torchsar.core import (
     Axis,
     Estimate,
     cis,
+    differentiable,
     power_of,
 )
 from torchsar.radar import TriangularLadar
 
 
+@differentiable("no")
 def spectrum_correlation(
     sweeps: Tensor,
     radar: TriangularLadar,
@@ -135,6 +137,8 @@ class SpectrumCorrelation(_SweepEstimator):
         ValueError: If the window does not have two values.
     """
 
+    differentiable = "no"
+
     estimator = staticmethod(spectrum_correlation)
 
     def __init__(
@@ -149,6 +153,7 @@ class SpectrumCorrelation(_SweepEstimator):
         self.upsampling = upsampling
 
 
+@differentiable("where ok")
 def ml_peak(
     sweeps: Tensor,
     radar: TriangularLadar,

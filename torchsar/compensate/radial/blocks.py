@@ -134,6 +134,7 @@ class _SweepEstimator(Stage):
     neutral = {"velocity_m_s": 0.0}
     estimator: Callable[..., Estimate]
     azimuth_m: Tensor
+    differentiable = "where ok"
 
     def __init__(
         self, radar: TriangularLadar, window_m: Window, azimuth_m: float, assess: bool, **options: Any

@@ -15,6 +15,7 @@ from torchsar.core import (
     Stage,
     checked_samples,
     cis,
+    differentiable,
     power_of,
     refuse_non_finite_values,
 )
@@ -23,6 +24,7 @@ LEAST_GAIN = 0.05  # least gain of a pulse, so that a lost pulse is not amplifie
 _PAD = 4  # zero-padding of the transform, with which a peak is found to an eighth of a cell
 
 
+@differentiable("where ok")
 def pulse_gain(data: Tensor, *, assess: bool = True) -> Estimate:
     """Estimate the amplitude of every pulse from steady scatterers.
 
@@ -67,7 +69,7 @@ def pulse_gain(data: Tensor, *, assess: bool = True) -> Estimate:
     tiny = torch.finfo(power.dtype).tiny
     share = n * power / energy.clamp_min(tiny)
     explained = ((n * power).sum(-1) / energy.sum(-1).clamp_min(tiny)).detach()
-    weight = share.detach().square()
+    weight = share.square()
     fitted = (weight[..., None] * (demodulated * level.conj()[..., None]).real).sum(-2) / (weight * power).sum(
         -1, keepdim=True
     ).clamp_min(tiny)
@@ -126,6 +128,7 @@ class PulseGain(Stage):
 
     provides = ("gain",)
     neutral = {"gain": 1.0}
+    differentiable = "where ok"
 
     def __init__(self, assess: bool = True) -> None:
         super().__init__()

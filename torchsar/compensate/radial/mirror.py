@@ -13,10 +13,12 @@ from torchsar.compensate.radial.product import mirror_velocity
 from torchsar.core import (
     Axis,
     Estimate,
+    differentiable,
 )
 from torchsar.radar import TriangularLadar
 
 
+@differentiable("where ok")
 def mirror_product(
     sweeps: Tensor,
     radar: TriangularLadar,

@@ -28,6 +28,7 @@ from torchsar.core import (
     Signal,
     Stage,
     cis,
+    differentiable,
     power_of,
 )
 from torchsar.core.spline import Spline
@@ -38,6 +39,7 @@ from torchsar.optim import adam
 _SCENE = Wiener(level=4.0, share=0.02)
 
 
+@differentiable("where ok")
 def phase_polish(
     data: Tensor,
     *,
@@ -193,6 +195,7 @@ class PhasePolish(Stage):
 
     provides = ("phase_rad",)
     neutral = {"phase_rad": 0.0}
+    differentiable = "where ok"
 
     def __init__(self, iterations: int = 80, tolerance_rad: float = 0.005, assess: bool = True) -> None:
         super().__init__()

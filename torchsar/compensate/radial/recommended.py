@@ -29,6 +29,7 @@ from torchsar.compensate.radial.trajectory import (
 from torchsar.core import (
     Axis,
     Estimate,
+    differentiable,
     host_value,
     true_positions,
 )
@@ -38,6 +39,7 @@ from torchsar.metrics.ladar_bounds import integrated_range_detrended_bound_m
 from torchsar.radar import TriangularLadar, sweep_middles
 
 
+@differentiable("where ok")
 def radial_motion(
     sweeps: Tensor,
     radar: TriangularLadar,

@@ -18,6 +18,7 @@ from torchsar.core import (
     Axis,
     Estimate,
     cis,
+    differentiable,
     power_of,
     take,
 )
@@ -27,6 +28,7 @@ Bins = Literal["peak", "sum"]
 Unwrap = Literal["gradient", "per_pulse"]
 
 
+@differentiable("where ok")
 def segmented_interference(
     sweeps: Tensor,
     radar: TriangularLadar,

@@ -17,6 +17,7 @@ from torchsar.core import (
     Signal,
     Stage,
     checked_samples,
+    differentiable,
     level_of,
     linear_phasor,
     power_of,
@@ -57,6 +58,7 @@ class Chirplets:
     residual_share: Tensor
 
 
+@differentiable("no")
 def chirplet_clean(
     data: Tensor,
     prf_hz: float,
@@ -236,6 +238,8 @@ class ChirpletClean(Stage):
         oversampling: Image lines per Doppler cell.
         lines: Number of image lines about zero Doppler; by default all that the pulse rate holds.
     """
+
+    differentiable = "no"
 
     def __init__(
         self,

@@ -22,7 +22,7 @@ from torchsar.compensate.rotation.image_entropy import (
     values_of,
 )
 from torchsar.compensate.rotation.motion import Motion, each
-from torchsar.core import Draws, Estimate, Outcome, Signal, Stage, worst
+from torchsar.core import Draws, Estimate, Outcome, Signal, Stage, differentiable, worst
 from torchsar.optim import differential_evolution, genetic, grid_search, lbfgs, newton
 from torchsar.radar import InverseRadar
 
@@ -38,6 +38,7 @@ _OPTIONS: dict[str, tuple[str, ...]] = {
 }
 
 
+@differentiable("no")
 def entropy_rotation(
     figure: ImageEntropy, method: Method, where: Sequence[Vector] | Tensor, *, assess: bool = True, **options: Any
 ) -> Estimate:
@@ -243,6 +244,8 @@ class EntropyRotation(Stage):
         ValueError: If the method is none of these, an option is missing or belongs to another
             method, or the lists have the wrong number of values.
     """
+
+    differentiable = "no"
 
     def __init__(
         self,

@@ -355,7 +355,7 @@ class ImageEntropy:
             data.shape[-2] / prf_hz, objective.order, objective.range_term, yc_m is None, objective.variables
         )
         self.trials, self.dtype = data.shape[:-2], data.dtype
-        unit = unit_level(data.detach())
+        unit = unit_level(data)
         rms = power_of(unit).mean((-2, -1), keepdim=True).sqrt()
         # at unit rms, the squares of samples neither underflow nor overflow
         self.rows = (unit / torch.where(rms > 0, rms, 1)).reshape(-1, *data.shape[-2:])

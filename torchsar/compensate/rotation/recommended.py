@@ -36,6 +36,7 @@ from torchsar.core import (
     Stage,
     block_bytes_of,
     checked_samples,
+    differentiable,
     level_of,
     over_blocks,
     refuse_non_finite,
@@ -48,6 +49,7 @@ from torchsar.radar import InverseRadar
 from torchsar.radar.warp import k_of_shape, shape_of
 
 
+@differentiable("no")
 def uneven_rotation(
     data: Tensor,
     *,
@@ -150,6 +152,7 @@ def uneven_rotation(
     return _over_trials("uneven_rotation", find, assess, data, wavelength_m, prf_hz, range_m, yc_m)
 
 
+@differentiable("no")
 def coarse_rotation(
     data: Tensor,
     *,
@@ -288,6 +291,8 @@ class _Rotation(Stage):
     yc_m: the range centre deviation (m) known a priori, or None to estimate it.
     """
 
+    differentiable = "no"
+
     def __init__(
         self,
         radar: InverseRadar,
@@ -404,6 +409,7 @@ class RotationAutofocus(Stage):
 
     provides = ("phase_rad",)
     neutral = {"phase_rad": 0.0}
+    differentiable = "no"
 
     def __init__(self, radar: InverseRadar, search: int = 60, polish: int = 20, assess: bool = True) -> None:
         super().__init__()
@@ -454,6 +460,7 @@ class RotationAutofocus(Stage):
         return rotation_autofocus(data, prf_hz, k, phase_rad, **self.options)
 
 
+@differentiable("no")
 def rotation_autofocus(
     data: Tensor,
     prf_hz: float,

@@ -24,7 +24,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Outcome, unit_phasor
+from torchsar.core import Estimate, Outcome, differentiable, unit_phasor
 from torchsar.core.fft import smooth_length
 from torchsar.multichannel.channels import checked_channels
 from torchsar.multichannel.motion import PointMotion
@@ -195,6 +195,7 @@ def _assessed(
     return Estimate({"u_a_m_s": motion.u_a_m_s}, std, quality_of(found.snr_db), outcome, info)
 
 
+@differentiable("where ok")
 def interferometry(
     data: Tensor,
     radar: BistaticRadar,
@@ -350,9 +351,10 @@ def _slope(values: Tensor, position_m: Tensor) -> Tensor:
     values = values * torch.exp(-1j * rough[..., None] * position_m)
     phase = torch.angle(values * values.sum(-1, keepdim=True).conj())
     weight = values.abs()
-    total = weight.sum(-1, keepdim=True).clamp_min(TINY)
-    centred = position_m - (weight * position_m).sum(-1, keepdim=True) / total
-    return rough + (weight * centred * phase).sum(-1) / (weight * centred.square()).sum(-1).clamp_min(TINY)
+    total = weight.sum(-1, keepdim=True)
+    centred = position_m - (weight * position_m).sum(-1, keepdim=True) / torch.where(total > 0, total, 1)
+    spread = (weight * centred.square()).sum(-1)
+    return rough + (weight * centred * phase).sum(-1) / torch.where(spread > 0, spread, 1)
 
 
 def _fit_at(data: Tensor, radar: BistaticRadar, motion: PointMotion, weight: Tensor, time_s: Tensor) -> Found:

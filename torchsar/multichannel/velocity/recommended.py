@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Outcome
+from torchsar.core import Estimate, Outcome, differentiable
 from torchsar.multichannel.channels import checked_channels
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture, Dwell, SeenAperture, seen_aperture
@@ -23,6 +23,7 @@ from torchsar.multichannel.velocity.whitening import Whitening, sample_whitening
 from torchsar.radar import BistaticRadar
 
 
+@differentiable("where ok")
 def moving_point_velocity(
     data: Tensor,
     radar: BistaticRadar,

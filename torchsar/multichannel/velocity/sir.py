@@ -173,6 +173,7 @@ class SignalIntensityRatio(ChannelStage):
     provides = ("u_r_m_s",)
     neutral = {"u_r_m_s": 0.0}
     takes_empty = False
+    differentiable = "no"
 
     def __init__(
         self,

@@ -125,6 +125,7 @@ class _Velocity(Stage):
     also_on = (("channel", "pulse", "range"),)
     provides = UNKNOWNS
     neutral = dict.fromkeys(UNKNOWNS, 0.0)  # a point at rest in the middle of the scene
+    differentiable = "where ok"
 
     def __init__(
         self,
@@ -353,6 +354,8 @@ class GradientVelocity(LikelihoodVelocity):
 
     See `gradient_likelihood`; arguments as those of `LikelihoodVelocity`.
     """
+
+    differentiable = "no"
 
     def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0) -> Estimate:
         """Estimate the parameters that `unknowns` names, near a starting motion.

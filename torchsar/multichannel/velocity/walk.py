@@ -47,6 +47,7 @@ class WalkAmbiguity(Stage):
     works_on = ("channel", "pulse", "range")
     provides = ("ambiguity",)
     neutral = {"ambiguity": 0.0}
+    differentiable = "no"
 
     def __init__(
         self, radar: BistaticRadar, most: int = 2, range_m: float | None = None, *, assess: bool = True
@@ -127,6 +128,7 @@ class MigratingLines(Stage):
         self.walk = WalkAmbiguity(radar, assess=assess)
         self.correct = CorrectMigration(radar, Keystone(whole_swath=False))
         self.provides, self.neutral = estimator.provides, estimator.neutral
+        self.differentiable = estimator.differentiable
 
     def forward(self, signal: Signal) -> Estimate:
         """Estimate the velocity from channels with the axes (channel, pulse[, range]).
