@@ -1,4 +1,5 @@
-# make run: the embedded experiment. make test: the tests, in JOBS processes of one thread. Both set up $(VENV) first.
+# make run: the embedded experiment. make test: the tests that take at most two seconds each, in JOBS processes of one
+# thread; make test-slow: the others; TESTS chooses files. All set up $(VENV) first.
 # make docs: the documentation site, in docs/_build/html; it works without a network.
 # make package: sdist and wheel, and the wheel used outside the repository as its users do.
 # An environment that already has torch keeps it: make run VENV=/path/to/venv
@@ -17,15 +18,19 @@ export OMP_WAIT_POLICY
 
 PY    := $(VENV)/bin/python
 STAMP := $(VENV)/.torchsar-installed
+# Bytecode is kept: otherwise every worker, and every process that a test starts, compiles all files again.
+PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(PY) -m pytest -n $(JOBS) --dist worksteal
 
-.PHONY: run test lint docs docs-install package install clean
+.PHONY: run test test-slow lint docs docs-install package install clean
 
 run: install
 	$(VENV)/bin/torchsar run $(CONFIG) $(ARGS) --out $(OUT)
 
-# Bytecode is kept: otherwise every worker, and every process that a test starts, compiles all files again.
 test: install
-	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(PY) -m pytest -n $(JOBS) --dist worksteal $(TESTS) $(ARGS)
+	$(PYTEST) -m "not slow" $(TESTS) $(ARGS)
+
+test-slow: install
+	$(PYTEST) -m slow $(TESTS) $(ARGS)
 
 lint: install
 	$(VENV)/bin/ruff check .

@@ -29,6 +29,13 @@ def pytest_collection() -> Iterator[None]:
         gc.enable()
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Runs of the system geo_ocean are slow: they take as long as those of the six others."""
+    for item in items:
+        if "geo_ocean" in item.name.partition("[")[2]:
+            item.add_marker(pytest.mark.slow)
+
+
 @pytest.fixture(autouse=True, scope="session")
 def _process() -> None:
     torchsar.keep_freed_memory()  # as the commands do

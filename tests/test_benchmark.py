@@ -23,6 +23,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
+@pytest.mark.slow
 def test_every_part_of_a_config_is_measured(result: Path) -> None:
     found = json.loads(result.read_text(encoding="utf-8"))
     assert not found["failed"] and {"torch", "processor", "vectors", "cores"} <= found["machine"].keys()

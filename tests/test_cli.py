@@ -46,6 +46,7 @@ def test_list_explains_experiments_systems_stages_keys_and_data(capsys: pytest.C
     assert "c1 t + c2 t^2 + ...\n" in text and not re.search(r"[^.]\.\.\n", text)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words, lines",
     [
@@ -137,6 +138,7 @@ def test_progress_has_a_rate_and_a_remaining_time_once_work_is_long(capsys: pyte
     assert re.search(r"16/40 \[00:12<00:2\d, +[.\d]+ ?(trials/s|s/ trials)", capsys.readouterr().err)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["run", "sweep", "requires", "trade", "import", "list"])
 def test_the_first_line_comes_before_anything_heavy_is_imported(command: str, tmp_path: Path) -> None:
     """torch cannot be imported here at all, and the first line is there, in a pipe."""
@@ -197,6 +199,7 @@ def test_a_warning_is_shown_once(
         assert [sum(text in line for line in said) for text in ("aliased", "recommended failed", "again")] == [1, 1, 3]
 
 
+@pytest.mark.slow
 def test_run_prints_where_the_report_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "result"
     assert main(["run", str(write_tiny(tmp_path)), "world.noise.snr_db=30", "seed=5", "--out", str(out)]) == 0
@@ -312,6 +315,7 @@ def test_bad_recordings_are_named(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["raw.npz", "tiny.yaml"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes, expected",
     [

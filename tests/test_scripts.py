@@ -60,6 +60,7 @@ def test_the_sweep_of_the_documentation_is_right(printed: Printed, tmp_path: Pat
     assert rmse[0] < 0.15 and rmse[3] > rmse[0]
 
 
+@pytest.mark.slow
 def test_the_benchmark_of_sweeps_runs(printed: Printed) -> None:
     fork_workers()
     overrides = ["processor.recommended.stages.velocity.lines=16", "world.lines=384", "world.samples=128"]
@@ -69,6 +70,7 @@ def test_the_benchmark_of_sweeps_runs(printed: Printed) -> None:
         assert re.search(rf"^{name} +\d+ +\d+\.\d+", text, re.MULTILINE), text
 
 
+@pytest.mark.slow
 def test_the_share_of_time_in_which_sweeps_compute_is_measured(printed: Printed, tmp_path: Path) -> None:
     fork_workers()
     file = tmp_path / "busy.json"
@@ -80,6 +82,7 @@ def test_the_share_of_time_in_which_sweeps_compute_is_measured(printed: Printed,
     assert (row["sweep"], row["trials"], row["busy"]) == ("stripmap_doppler", 1, None)
 
 
+@pytest.mark.slow
 def test_autofocus_is_composed(printed: Printed, tmp_path: Path) -> None:
     arguments = ["--trials", "2", "--candidates", "2", "--pulses", "64"]
     text = printed(ROOT / "scripts" / "compose_autofocus.py", arguments)
@@ -94,6 +97,7 @@ def test_autofocus_is_composed(printed: Printed, tmp_path: Path) -> None:
     assert (tmp_path / "compose_autofocus.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_a_network_learns_to_focus(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = scripting.run("learned_autofocus", tmp_path, {"learned_autofocus"}, capsys)
     rows = scripting.rows(text, 34)

@@ -21,6 +21,7 @@ def test_condition(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert condition["N = 3, uneven, condition"][3] == pytest.approx(5.8, abs=0.05)
 
 
+@pytest.mark.slow
 def test_ambiguity(capsys: pytest.CaptureFixture[str]) -> None:
     script("geo_ambiguity").main([])
     beyond = rows(capsys.readouterr().out, 34)
@@ -29,6 +30,7 @@ def test_ambiguity(capsys: pytest.CaptureFixture[str]) -> None:
     assert beyond["range walk: pulse rates"] == [1, -1] and abs(beyond["interferometry alone"][0] - 25) > 40
 
 
+@pytest.mark.slow
 def test_speed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     table = rows(run("geo_speed", tmp_path, {"estimators", "migration"}, capsys), 28)
     assert table["N = 2, complex64"][-2] < -125 and table["N = 3, complex64"][-2] < -118

@@ -12,6 +12,7 @@ import pytest
 from tests.scripting import rows, run
 
 
+@pytest.mark.slow
 def test_estimators(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = run("rotation_estimators", tmp_path, {"time_and_error"}, capsys)
     first, second = text.split("\n\n")

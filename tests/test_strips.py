@@ -115,6 +115,7 @@ def test_the_image_is_that_of_one_transform_below_minus_60_db(folder: Path) -> N
     assert (folder / "out" / "quick_look.png").stat().st_size > 1000 and (folder / "out" / "config.yaml").is_file()
 
 
+@pytest.mark.slow
 def test_a_killed_program_goes_on_with_the_same_bits(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert focus(folder, "whole") == 0
     killed_in(lambda: focus(folder, "out"), 3)
@@ -257,6 +258,7 @@ def test_an_estimate_that_failed_is_shown_with_the_reason_and_the_value_in_its_p
     assert shown.endswith(f" ({Outcome.NOISE.message})") and used == "torchsar: focus uses doppler_hz 0"
 
 
+@pytest.mark.slow
 def test_the_memory_is_that_of_a_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torchsar.io.strip._PART_BYTES", 1 << 20)
     lines, samples = 14_336, 512

@@ -101,6 +101,7 @@ CELLS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name, world, snr_db, least", CELLS)
 def test_cells_that_were_wrong(name: str, world: str, snr_db: float | None, least: float) -> None:
     entry = next(entry for entry in ENTRIES if entry.name == name)

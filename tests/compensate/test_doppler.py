@@ -158,6 +158,7 @@ def test_scalar_optimisers_find_the_minimum_of_each_trial() -> None:
     torch.testing.assert_close(curvature, torch.full((3,), 2.2, dtype=torch.float64), atol=0.2, rtol=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("squint", "ambiguity", "seed"), [(0.0, 0, 1), (0.3, 0, 2), (2.0, 1, 3)])
 def test_centroid_of_points_cut_by_the_ends_of_the_strip(squint: float, ambiguity: int, seed: int) -> None:
     radar = kondor(0.3, squint)
@@ -226,6 +227,7 @@ BLOCKS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "lines", "columns", "baseband"), BLOCKS)
 def test_recorded_blocks_without_prior_knowledge(
     recorded, name: str, lines: tuple[int, int], columns: tuple[int, int], baseband: float | None

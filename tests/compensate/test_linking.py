@@ -111,6 +111,7 @@ def test_no_part_of_a_long_record_slips() -> None:
     assert float(phase_rmse(found["phase_rad"], torch.zeros(2, 2 * N)).max()) < 0.1
 
 
+@pytest.mark.slow
 def test_few_points_are_not_linked() -> None:
     """Two of these trials were ok with .78 and .05 rad, and deviations of .06 and .006 rad."""
     batch = scintillating(10.0, 2, 1e12)(12, 3000)
@@ -136,6 +137,7 @@ def changing(trials: int, points: int, pulses: float, seed: int) -> tuple[Tensor
     return scene * torch.exp(1j * phase)[..., None], phase
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("points", "pulses", "least_ok"), [(3, 10.0, 0.0), (10, 10.0, 0.0), (100, 10.0, 0.8)])
 def test_points_that_change_are_not_sure_and_wrong(points: int, pulses: float, least_ok: float) -> None:
     """46 % of 3 points were ok and wrong, 29 % of 10; the error of 100 was 2.1 deviations."""

@@ -144,6 +144,7 @@ def test_paths_that_err_by_a_wavelength_give_the_image_of_the_true_path() -> Non
     assert bool((after < -10).all()) and bool((before > -3).all()), (before, after)
 
 
+@pytest.mark.slow
 def test_a_start_that_ends_in_a_wrong_minimum_does_no_harm() -> None:
     """With envelopes in motion this trial ends 2.3 mm off; the sharpest image counts."""
     recording, _, true_m = with_navigation(range(2, 3), 0.05, 20.0, seed=1000)
@@ -154,6 +155,7 @@ def test_a_start_that_ends_in_a_wrong_minimum_does_no_harm() -> None:
     assert error < 0.1 and error < 2 * std, (error, std)
 
 
+@pytest.mark.slow
 def test_a_wrong_minimum_that_all_starts_have_in_common_is_not_ok() -> None:
     """Parts of this path end at ramps of phase of their own, 2.9 mm off, from every start."""
     recording, _, true_m = with_navigation(range(3, 4), 0.01, 20.0, seed=1025)

@@ -34,6 +34,7 @@ def test_few_points_reach_the_bound(points: int, snr_db: float) -> None:
     assert 0.9 < of_rms(error[explained]) / bound < 1.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rows", "per_row"), [(2, 2), (2, 4), (4, 4)])
 def test_rows_of_points_of_a_target_that_turns(rows: int, per_row: int) -> None:
     """The rotation bends the phases of the ranges by 0.07 rad against each other.

@@ -367,6 +367,7 @@ def test_wiener_weights():
     torch.testing.assert_close(found, expected - expected.mean(-1, keepdim=True), atol=1e-14, rtol=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("snr_db", [0.0, 20.0])
 @pytest.mark.parametrize("points", [2, 3, 5])
 def test_side_lobes_of_a_few_points_are_no_scene(points, snr_db):

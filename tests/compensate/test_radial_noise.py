@@ -39,6 +39,7 @@ def noisy(snr_db: float, n: int = 256, trials: int = 8, seed: int = 1):
     return seen(n=n, trials=trials, snr_db=float(snr_db), dtype=torch.complex64, fidelity=LINES, seed=seed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("snr_db", [-10, 0, 10, 30])
 def test_errors_match_the_reference_table(snr_db) -> None:
     """Medians over records of the rms error are within a fifth of the reference, or better.
@@ -62,6 +63,7 @@ def test_errors_match_the_reference_table(snr_db) -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("snr_db", [-5, 0, 10, 15])
 def test_distance_from_the_bounds(snr_db) -> None:
     """Variances: segmented 4/3 of the free bound, peaks on it, mirror product near its own."""
@@ -106,6 +108,7 @@ def test_the_chain_tolerates_random_walks_of_radians() -> None:
     assert bool(found.ok.all()) and float(range_rms(found, truth, RADAR, pulse).max()) < 15e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(ESTIMATORS))
 def test_noise_alone_is_not_ok(name) -> None:
     noise = torch.randn(50, 2, 16, 512, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
@@ -115,6 +118,7 @@ def test_noise_alone_is_not_ok(name) -> None:
         assert int(found.ok.sum()) <= 1 and bool(torch.isfinite(found["velocity_m_s"]).all())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["segmented", "peak", "mirror", "correlation"])
 def test_failed_estimates_are_not_ok(name) -> None:
     """At -15 dB and below, noise exceeds the peaks.

@@ -43,6 +43,7 @@ def rms(x: Tensor) -> float:
     return float(x.square().mean().sqrt())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("snr_db", [0.0, 20.0])
 def test_satellites_of_the_direct_generator_reach_the_bound_and_their_errors_are_predicted(
     snr_db: float,
@@ -86,6 +87,7 @@ ESTIMATORS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_noise_and_zeros_are_not_ok(name: str) -> None:
     data = torch.cat([noise(1, 5, PULSES, BINS), torch.zeros(1, PULSES, BINS)]).to(torch.complex64)

@@ -145,6 +145,7 @@ def test_no_compensation_is_uniform_rotation_without_range_phase() -> None:
     torch.testing.assert_close(of.uncompensated(), still[0], atol=1e-12, rtol=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variables", ["raw", "shape"])
 @pytest.mark.parametrize("factor", [0.9, 1.0, 1.1])
 def test_descents_from_any_start_reach_one_minimum(variables, factor: float) -> None:
@@ -160,6 +161,7 @@ def test_descents_from_any_start_reach_one_minimum(variables, factor: float) -> 
     assert torch.equal(descent["warp_k"], torch.stack([descent["k1_per_s"], descent["k2_per_s2"]]))
 
 
+@pytest.mark.slow
 def test_undamped_newton_diverges_and_is_not_ok() -> None:
     of = figure(target())
     for factor in (0.9, 1.1):
@@ -169,6 +171,7 @@ def test_undamped_newton_diverges_and_is_not_ok() -> None:
         assert entropy_rotation(of, "newton", of.start(factor * OMEGA, factor * K)).ok
 
 
+@pytest.mark.slow
 def test_population_searches_find_the_minimum_inside_their_box() -> None:
     of = figure(target(), oversampling=2.0, taps=4, lines=600)
     best = entropy_rotation(of, "descent", of.start(OMEGA, K)).info["entropy_nats"]
@@ -235,6 +238,7 @@ def test_uniform_rotation_is_not_improved() -> None:
     assert abs(float(found["k1_per_s"])) < 3, "24 points shift the minimum by less than this"
 
 
+@pytest.mark.slow
 def test_a_batch_equals_single_trials() -> None:
     data = torch.stack([target(0), 100 * target(1), target(2, k=torch.tensor([20.0, -500.0], dtype=F64))])
     kinds = {
@@ -268,6 +272,7 @@ def stages() -> list:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", stages(), ids=lambda stage: stage.method)
 @pytest.mark.parametrize("dtype", [torch.complex64, torch.complex128])
 def test_stages_provide_what_they_declare(stage, dtype: torch.dtype) -> None:

@@ -24,6 +24,7 @@ RADIANS = 4 * math.pi / RADAR.wavelength_m
 KNOWN = ("frequency_hz", "transmitter_m", "path_reference_m")
 
 
+@pytest.mark.slow
 def test_errors_of_a_strip_are_found_within_their_deviation_and_the_image_is_that_of_the_true_path() -> None:
     recording, truth = strips(seed=5)
     known = {name: recording.aux[name] for name in KNOWN}
@@ -46,6 +47,7 @@ def test_errors_of_a_strip_are_found_within_their_deviation_and_the_image_is_tha
     assert bool((after < -22).all()) and bool((bad > -12).all()), (bad, after)
 
 
+@pytest.mark.slow
 def test_errors_of_several_fringes_are_found() -> None:
     recording, truth = strips(error_m=5e-3, seed=8)
     found = strip_autofocus(recording.signal.data, recording.aux["frequency_hz"], path_of(recording), **STRIP)
@@ -56,6 +58,7 @@ def test_errors_of_several_fringes_are_found() -> None:
     assert bool((before > 1).all()) and bool((error < 0.25).all()), (before, error)
 
 
+@pytest.mark.slow
 def test_noise_zeros_and_few_scatterers_are_not_ok_and_pulses_of_zeros_are_left_out() -> None:
     recording, _ = strips(seed=6)
     frequency, path = recording.aux["frequency_hz"], path_of(recording).of_trial((0,))
@@ -87,6 +90,7 @@ def test_bad_strips_are_refused(changed: dict[str, float], sentence: str) -> Non
         )
 
 
+@pytest.mark.slow
 def test_values_without_assessment_are_those_with_it() -> None:
     recording, _ = strips(seed=5)
     known = {name: recording.aux[name] for name in KNOWN}

@@ -57,6 +57,7 @@ def z_scores(found: Estimate, k: Tensor, yc_m: float | None = 0.0) -> Tensor:
     return torch.stack([(found[name] - value) / found.std[name] for name, value in truth.items()], -1)
 
 
+@pytest.mark.slow
 def test_any_rotation_is_found_without_a_start() -> None:
     """Rotations far outside of any box about the truth; what is wrong is not ok.
 
@@ -69,6 +70,7 @@ def test_any_rotation_is_found_without_a_start() -> None:
     assert (right.sum(-1) >= 3).all() and not (found.ok & ~right).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known", [True, False])
 @pytest.mark.parametrize("order", [1, 2, 3, 4])
 def test_every_order_with_the_centre_known_or_not(order: int, known: bool) -> None:
@@ -79,6 +81,7 @@ def test_every_order_with_the_centre_known_or_not(order: int, known: bool) -> No
     assert found["yc_m"] == 1.5 if known else found.std["yc_m"] < 0.1
 
 
+@pytest.mark.slow
 def test_a_known_centre_per_trial() -> None:
     data = torch.stack([target(4, yc_m=yc) for yc in (-2.0, 0.0, 1.5)])
     centre = torch.tensor([-2.0, 0.0, 1.5], dtype=F64)
@@ -90,6 +93,7 @@ def test_a_known_centre_per_trial() -> None:
     assert (wrong["omega_rad_s"] / OMEGA - 1).abs().tolist()[0] > 0.02, "a wrong range centre biases the rate"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("snr_db", [0.0, 20.0])
 def test_predicted_std_matches_the_errors_and_the_bound(snr_db: float) -> None:
     data = torch.stack([target(0, snr_db, draw=draw) for draw in range(10)])
@@ -104,6 +108,7 @@ def test_predicted_std_matches_the_errors_and_the_bound(snr_db: float) -> None:
     assert (rms > 0.5).all() and (rms < 1.5).all()
 
 
+@pytest.mark.slow
 def test_few_scatterers_are_judged_as_well_as_many() -> None:
     """Three points contradict hardly any rotation; the noise alone then limits the errors."""
     data = []
@@ -117,6 +122,7 @@ def test_few_scatterers_are_judged_as_well_as_many() -> None:
     assert (over_std < 1.7).all() and 0.6 < float(over_std.square().mean().sqrt()) < 1.4
 
 
+@pytest.mark.slow
 def test_a_target_of_many_weak_scatterers_is_fitted_with_more_of_them() -> None:
     """The usual number explains 47 % of the energy of 600 scatterers."""
     clean = echo(*points(9000, 600))
@@ -133,6 +139,7 @@ def test_a_peak_of_the_noise_does_not_show_the_rate() -> None:
     assert found.info["scatterers"] > 12 and found.doubtful
 
 
+@pytest.mark.slow
 def test_each_step_reduces_the_error() -> None:
     data = targets(4)
     errors = {
@@ -143,6 +150,7 @@ def test_each_step_reduces_the_error() -> None:
     assert (errors["uneven"] < 2e-3).all() and (errors["phase_fit"] > errors["uneven"]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_a_batch_equals_single_trials(name: str) -> None:
     """Beside trials that are stronger, empty, pure noise, or that converge after another step."""
@@ -163,6 +171,7 @@ def test_a_batch_equals_single_trials(name: str) -> None:
     torch.testing.assert_close(pair[0], together["warp_k"][::4], rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_single_precision_is_enough(name: str) -> None:
     data = targets(2)
@@ -171,6 +180,7 @@ def test_single_precision_is_enough(name: str) -> None:
     assert all(value.dtype == F64 for value in single.value.values())
 
 
+@pytest.mark.slow
 def test_the_scale_of_the_data_does_not_matter() -> None:
     scale = torch.tensor([1e-300, 1e-20, 1.0, 1e20, 1e300], dtype=F64)
     scaled = scale[:, None, None] * target(0)
@@ -181,6 +191,7 @@ def test_the_scale_of_the_data_does_not_matter() -> None:
     torch.testing.assert_close(single["warp_k"], wanted.expand(3, 2), rtol=1e-4, atol=0)
 
 
+@pytest.mark.slow
 def test_the_origin_of_the_range_axis_is_the_centre_deviation() -> None:
     """A shift of the whole axis is a centre deviation; a cropped axis is not."""
     data = target(4)
@@ -225,6 +236,7 @@ def degenerate() -> dict[str, Tensor]:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_undetermined_rotations_are_finite_and_not_ok(name: str) -> None:
     kinds = degenerate()
@@ -241,6 +253,7 @@ def failing(*_: object) -> None:
     raise AssertionError("the assessment was called")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_values_do_not_depend_on_the_assessment(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     data = torch.stack([target(0), target(1, -5.0), noise(0, PULSES, 24)]).to(torch.complex64)
@@ -252,6 +265,7 @@ def test_values_do_not_depend_on_the_assessment(name: str, monkeypatch: pytest.M
     assert not bare.std and (bare.outcome == Outcome.NOT_ASSESSED).all() and bare.ok.all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_outcomes_name_what_was_seen(name: str) -> None:
     kinds = degenerate()
@@ -289,6 +303,7 @@ def signal_of(data: Tensor) -> Signal:
     return Signal(data, RADAR.raw_axes(*data.shape[-2:], start_s=3.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "stage",
     [
@@ -319,6 +334,7 @@ def test_stages_equal_the_functions() -> None:
     assert torch.equal(held["warp_k"], found["warp_k"])
 
 
+@pytest.mark.slow
 def test_steps_without_noise_do_not_go_back_and_forth() -> None:
     """Pairs of scatterers in one cell contradict the model. Steps of the rate of 0.5 to
     3 % reversed each other to the last, and the deviation was as large.
@@ -330,6 +346,7 @@ def test_steps_without_noise_do_not_go_back_and_forth() -> None:
     assert (after / before - 1).abs().max() < 0.003
 
 
+@pytest.mark.slow
 def test_deviations_hold_where_scatterers_lie_side_by_side() -> None:
     """Several scatterers in a few Doppler cells of one range cell share errors of the model."""
     radar = InverseRadar(LIGHT_M_S / WAVELENGTH, LIGHT_M_S / (2 * 0.45), 24e3)
@@ -381,6 +398,7 @@ def off_the_warp(error: Tensor, phi: Tensor) -> float:
     return float(torch.angle(torch.exp(1j * best) / torch.exp(1j * best).mean()).square().mean().sqrt())
 
 
+@pytest.mark.slow
 def test_phase_and_rotation_are_estimated_in_turn() -> None:
     """A free phase per pulse and a rotation.
 

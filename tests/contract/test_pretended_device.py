@@ -175,6 +175,7 @@ def figures(loaded: Loaded, device: str, trials: list[int]) -> dict[str, Tensor]
     return {**bounds, **{key: x for key, x in metrics.items() if key != "seconds"}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("system", SMALL)
 def test_systems(system: str, place: Place, tmp_path: Path) -> None:
     """Simulation, recommended chain, metrics and bounds, of few trials and of the same twice."""
@@ -199,6 +200,7 @@ def test_systems(system: str, place: Place, tmp_path: Path) -> None:
     compare(system, every[0], every[-1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("system", SMALL)
 def test_systems_work_where_a_device_is_the_default(system: str, place: Place, tmp_path: Path) -> None:
     loaded = small(system, tmp_path)
@@ -207,6 +209,7 @@ def test_systems_work_where_a_device_is_the_default(system: str, place: Place, t
     assert all(map(place.holds, found.values()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sweep", CHAIN_WAITS)
 @torch.no_grad()
 def test_chains_wait_seldom(sweep: str) -> None:

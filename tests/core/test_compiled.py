@@ -85,6 +85,7 @@ def compiled(module: nn.Module, counts: list[int] | None = None, fullgraph: bool
     return torch.compile(module, fullgraph=fullgraph, backend=backend)
 
 
+@pytest.mark.slow
 def test_a_chain_is_one_graph_for_each_length() -> None:
     chain, graphs = Chain(level=Level(), divide=use(Divide(), level="level")), []
     program, counts = compiled(chain, graphs), []
@@ -106,6 +107,7 @@ def test_a_trace_has_no_times() -> None:
     assert list(chain.trace(x).seconds) == ["level", "divide"]
 
 
+@pytest.mark.slow
 def test_fixed_values_are_constants_and_are_checked() -> None:
     stage, x, step = Gain(), signal_of(), torch.arange(3.0)
     chain = Chain(gain=use(stage, step="given.step"))
@@ -119,6 +121,7 @@ def test_fixed_values_are_constants_and_are_checked() -> None:
         torch.testing.assert_close(program(x, {"given.step": torch.arange(4.0)}).data, 12 * x.data)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage, values", [(Gain(), {"step": torch.ones(2)}), (Reading(), {"level": torch.ones(2)})])
 def test_what_one_graph_cannot_hold_runs_between_graphs(stage: Stage, values: dict[str, Tensor]) -> None:
     x, y = signal_of(requires_grad=True), signal_of(requires_grad=True)
@@ -143,6 +146,7 @@ class Table(Stage):
         return signal.with_data(signal.data.clone().mul_(table) if self.inplace else signal.data * table)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "chain",
     [
@@ -173,6 +177,7 @@ def test_a_table_is_a_value_of_the_program() -> None:
         torch.testing.assert_close(program(other).data, Table()(other).data)
 
 
+@pytest.mark.slow
 @torch.no_grad()
 def test_a_program_does_not_write_into_its_constants() -> None:
     """What it writes would be lost; such a stage runs between two graphs."""

@@ -61,6 +61,7 @@ def test_compressed_peaks_lie_at_the_receive_range_with_the_phase_of_the_path(du
         assert radar.wave_speed_m_s == C and float((left - 1).abs().max()) < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("lit_s", "pulse_s"), [(2.0, 2e-6), (None, 1.9931e-6)])
 def test_the_recommended_chain_works_as_on_the_simulator_of_the_package(lit_s, pulse_s):
     """Raw channels of moving points, lit by a spot or seen through the pattern of an element."""

@@ -103,6 +103,7 @@ POSITIONS = ((60.0, 35.0), (-110.0, -50.0), (3.0, 90.0))
 GATES = {"pattern": (Pattern(), -100.0), "long element": (Pattern(1.0), -98.0), "band": (BandLimited(4.5), -36.0)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gate, limit_db", GATES.values(), ids=list(GATES))
 @pytest.mark.parametrize("n_pulse, n_range", [(240, 64), (181, 51)])
 def test_points_lie_and_migrate_as_by_direct_summation(gate, limit_db, n_pulse, n_range):
@@ -136,6 +137,7 @@ def test_a_side_lobe_appears_where_direct_summation_puts_it():
     assert mismatch_db(with_lobe, direct(geo_radar(), second.found, 90, None, Pattern())) < -50
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gate", [BandLimited(4.5), Pattern()])
 def test_cells_beyond_a_frame_do_not_wrap(gate):
     """Cells that migrate past the far end leave side lobes at most.
@@ -154,6 +156,7 @@ def test_cells_beyond_a_frame_do_not_wrap(gate):
 FRAMES = {"line": None, "frame": 24, "one sample": 1}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gate", [BandLimited(4.5), Pattern(), BandLimited(20.0)], ids=["band", "pattern", "wide band"])
 @pytest.mark.parametrize("n_range", FRAMES.values(), ids=list(FRAMES))
 def test_power_of_a_sample_is_the_given_one(gate, n_range):

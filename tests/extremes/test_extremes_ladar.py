@@ -73,6 +73,7 @@ def test_nothing(name) -> None:
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", IDS)
 def test_noise_from_none_to_nothing_else(name) -> None:
     """From 100 dB down the error never falls with the noise rising, and what counts as reliable is

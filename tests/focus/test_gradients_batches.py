@@ -19,6 +19,7 @@ def rows(form):
     return run
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", FORMS)
 def test_gradcheck_in_raw_velocity_and_frame(form):
     torch.manual_seed(0)

@@ -50,6 +50,7 @@ def _images_are_dropped():
     helpers.spectrum_of.cache_clear()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_stolt_is_exact_over_the_swath(name):
     case = CASES[name]()
@@ -59,6 +60,7 @@ def test_stolt_is_exact_over_the_swath(name):
         assert max(abs(x) for x in helpers.peak_offset(image, case.line, cell)) < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["kondor", "kondor_squint", "radarsat"])
 def test_bulk_and_refocus_is_enough_from_orbit(name):
     case = CASES[name]()
@@ -76,6 +78,7 @@ def test_bulk_and_refocus_displaces_where_the_requirements_predict_it():
     assert max(abs(x) for x in helpers.peak_offset(image, case.line, case.cells[0])) > 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["kondor_squint", "airborne_squint"])
 def test_backprojection_agrees_with_stolt_in_phase_and_shape(name):
     case = CASES[name]()
@@ -97,6 +100,7 @@ def test_backprojection_agrees_with_stolt_in_phase_and_shape(name):
         assert error_db(gain * other, patch) < -30
 
 
+@pytest.mark.slow
 def test_range_doppler_is_a_baseline_without_squint_only():
     straight, squinted = CASES["kondor"](), CASES["kondor_squint"]()
     image = image_of(range_doppler, "kondor")
@@ -112,6 +116,7 @@ def test_range_doppler_is_a_baseline_without_squint_only():
     assert rows[0].ok and not rows[1].ok
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["kondor_squint", "radarsat"])
 @pytest.mark.parametrize("form", [omega_k, omega_k_stolt, range_doppler])
 def test_complex64_image_is_the_complex128_image(name, form):
@@ -133,6 +138,7 @@ def exact_patch(name, lines, cells):
     return image_of(omega_k_stolt, name)[lines][:, cells]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name, dwell_s", [("airborne", 3.0), ("kondor_squint", 0.6)])
 def test_predicted_phase_of_bulk_and_refocus_is_the_measured_one(name, dwell_s):
     """Spectra of the bulk + refocus and the exact response of a target at the edge of the swath,

@@ -146,6 +146,7 @@ RAILS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RAILS)
 def test_rails_and_near_fields(name):
     places, reference_m, points = RAILS[name]
@@ -170,6 +171,7 @@ def test_a_centre_may_be_given():
     assert stage.sampling_limits(antennas(aux), WIDE_HZ)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reference_m", [0.0, 4.0])
 def test_a_whole_circle(reference_m):
     turn = torch.linspace(0, 2 * math.pi, 401, dtype=torch.float64)[:-1]

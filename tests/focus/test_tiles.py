@@ -22,6 +22,7 @@ from torchsar.focus.tiles.scene import _pixel_rule
 from torchsar.radar import LIGHT_M_S
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(1000, 1016))
 def test_the_promised_error_holds_in_any_geometry(seed: int) -> None:
     drawn, wanted = case(seed), (-50.0, -70.0, -90.0)[seed % 3]
@@ -371,6 +372,7 @@ def about_a_scene(turns: float, pulses: int, raised_m: float = 0.0) -> Case:
     return Case(frequency, place, None, 2 * torch.linalg.vector_norm(place, dim=-1), grid, noise)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("turns", "raised_m", "bistatic"), [(1.0, 0.0, False), (-0.4, 0.0, False), (-0.4, 0.0, True), (1.5, 60.0, False)]
 )
@@ -397,6 +399,7 @@ def pointed(place: Tensor, points: Tensor, width: float, looks: Tensor | float =
     return torch.exp(-((away[..., 0] / torch.linalg.vector_norm(away, dim=-1) - looks) / width).square())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "wanted"),
     [("beam", -45.0), ("beam", -80.0), ("squint", -80.0), ("pointing", -60.0), ("gaps", -60.0), ("hills", -45.0)]

@@ -113,6 +113,7 @@ def test_spread_equals_the_predicted_std():
     assert float(found.info["snr_db"].mean()) == pytest.approx(30 - 3, abs=3.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "prf, power, snr_db, largest",
     [
@@ -197,6 +198,7 @@ def test_stages_remove_the_differences():
     torch.testing.assert_close(flat_line, line * (10 ** (-GAIN / 20) * torch.exp(-1j * PHASE))[:, None])
 
 
+@pytest.mark.slow
 def test_trials_are_independent_and_empty_ones_not_ok():
     radar = published_radar()
     data = differed(clutter(radar, flat, 30.0, n_range=60), radar)

@@ -72,6 +72,7 @@ def test_a_ship_is_found_removed_and_relocated() -> None:
     assert float(estimate["u_r_m_s"][1:].abs().max()) == 0
 
 
+@pytest.mark.slow
 def test_trials_are_independent() -> None:
     sea, (body,) = scenes()[1], made().bodies
     both = flow()(sea.with_data(torch.stack([sea.data, scenes()[0].data])))
@@ -83,6 +84,7 @@ def test_trials_are_independent() -> None:
     assert known_.estimate["u_r_m_s"][:, 0].tolist() == [8, 6]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rebuild", [LeastSquares(2), MinimumMeanSquare(3, prior=FlatBand(350.0))])
 def test_clutter_shows_that_channels_are_not_balanced(rebuild) -> None:
     """Moving targets were reliable with speeds of -0.4 m/s for 10, displaced by 170 m."""
@@ -172,6 +174,7 @@ def test_side_lobes_of_a_ship_are_not_targets() -> None:
     assert not movers._side_lobe(replace(beside, motion=replace(beside.motion, y0_m=ship.motion.y0_m + 300.0)), ship)
 
 
+@pytest.mark.slow
 def test_any_reconstruction_images_the_stationary_scene() -> None:
     for rebuild in (LeastSquares(1), MinimumMeanSquare(3)):
         scene = flow(rebuild=rebuild)(scenes()[0], known=[known()])

@@ -133,6 +133,7 @@ TABLE = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("prf_hz", "raw_db", "error"), TABLE)
 def test_mean_errors_of_the_second_table(prf_hz, raw_db, error):
     radar = published_radar(prf_hz=prf_hz)

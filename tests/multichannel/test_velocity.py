@@ -82,6 +82,7 @@ def test_model_is_the_echo_and_its_slopes():
         torch.testing.assert_close(torch.angle(ends[0] * ends[1].conj()) / 2e-4, slopes[i], atol=1e-4, rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("snr_db", "worst", "move"),
     [(0.0, 1.3, {"u_r": 10.0}), (7.0, 1.3, {"u_r": -7.0, "u_a": 3.0, "y0": 40.0}), (-10.0, 1.6, {"u_r": 4.0})],

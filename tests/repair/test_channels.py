@@ -127,6 +127,7 @@ def test_too_few_lines_raise():
         estimate_imbalance(torch.zeros(4, 8, dtype=torch.complex64))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name, hz", [("radarsat1_english_bay.npz", 488.0), ("radarsat1_squamish.npz", 549.0)])
 def test_even_and_odd_lines_of_recorded_data(recorded, name, hz):
     clean = read_stripmap(recorded(name))

@@ -137,6 +137,7 @@ def test_defocus_inverts_and_is_the_adjoint(doppler: float) -> None:
     torch.testing.assert_close((operator.focus(x).conj() * y).sum(), (x.conj() * operator.defocus(y)).sum())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "seed, snr_db, reach", [(1, None, -30.9), (1, 20.0, -30.0), (2, 20.0, -30.0), (3, 20.0, -30.0)]
 )
@@ -192,6 +193,7 @@ def test_one_percent_of_lines_takes_few_focusings(monkeypatch) -> None:
     assert sum(columns) <= 22 * signal.data.shape[-2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pulses, looks", [(96, 4), (90, 5), (77, 6), (64, 1)])
 def test_blocks_equal_the_whole(monkeypatch, pulses: int, looks: int) -> None:
     """With gradients the scene is focused as a whole, without them in blocks."""
@@ -295,6 +297,7 @@ def block_of(recorded):
     return block
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, loss, reach",
     [

@@ -70,6 +70,7 @@ def image_error_db(repaired: torch.Tensor, clean: Recording) -> float:
     return float(error_db(focus(clean.signal.with_data(repaired)), focus(clean.signal)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("snr_db", [None, 20.0])
 @pytest.mark.parametrize("kind", ["one", "two", "comb5", "comb9", "comb25", "random", "speckle"])
 def test_a_clean_scene_is_unchanged(kind: str, snr_db: float | None) -> None:
@@ -89,6 +90,7 @@ def mean_db(values: list[float]) -> float:
     return float(10 * torch.log10((10 ** (torch.tensor(values) / 10)).mean()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["random", "speckle"])
 def test_errors_reach_the_reference_figures(kind: str) -> None:
     """Errors against those of a reference implementation, mean of six cases.
@@ -124,6 +126,7 @@ def test_drop_marks_the_contaminated_lines_as_missing() -> None:
     assert not bool(subtract_interference(impaired.signal.data).missing.any())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "impairments, loss_db",
     [
@@ -261,6 +264,7 @@ def bench_of(recorded):
     return cache(lambda name: Bench(name, recorded(name)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, cases",
     [
@@ -308,6 +312,7 @@ def test_interference_that_is_not_narrowband_is_not_ok(stage):
     assert found.outcome.tolist() == [Outcome.OK, Outcome.MISFIT]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", [SubtractInterference, NotchInterference, DropInterference])
 def test_outcomes_and_lines_without_assessment(stage, monkeypatch):
     """Most lines are given up where they all hold six wide interferers."""

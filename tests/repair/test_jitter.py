@@ -94,6 +94,7 @@ def test_coinciding_instants_raise(bad, method):
         method(clutter(1, 64), torch.tensor(bad, dtype=torch.float64))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("snr_db, cycles, period", [(60.0, 0.2137, 4), (30.0, -0.37, 4), (40.0, 0.11, 13)])
 def test_pilot_reaches_the_predicted_error(snr_db, cycles, period):
     true = OFFSETS if period == 4 else offsets(period)
@@ -107,6 +108,7 @@ def test_pilot_reaches_the_predicted_error(snr_db, cycles, period):
         assert 0.85 < float(error / predicted) < 1.15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("length", [64, 512, 4096, 65536])
 def test_the_period_of_a_pilot_without_noise_is_not_a_multiple(length: int):
     """Rounding errors of strong jitter looked like jitter of two or three times the period."""
@@ -118,6 +120,7 @@ def test_the_period_of_a_pilot_without_noise_is_not_a_multiple(length: int):
         assert estimate_jitter_pilot(pilot)["period"].tolist() == [period] * len(pilot)
 
 
+@pytest.mark.slow
 def test_a_pilot_without_jitter_gives_zero_offsets():
     pilot = PeriodicJitter((0.0,)).pilot(
         torch.zeros(1, dtype=torch.float64), Draws(0, trials=range(100)), torch.zeros(1, dtype=torch.complex64)
@@ -184,6 +187,7 @@ def small_jittered():
     return recording, truth.clean.signal
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("period, seed", [(4, 0), (8, 1), (5, 2)])
 def test_blind_offsets_of_simulated_clutter(period, seed):
     true = offsets(period, 0.1, seed)
@@ -204,6 +208,7 @@ def test_blind_estimate_of_an_empty_trial_is_not_ok():
     torch.testing.assert_close(estimate["offset_samples"][0], estimate_jitter_blind(y[:1])["offset_samples"][0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name, seed", [("radarsat1_english_bay.npz", 0), ("radarsat1_squamish.npz", 1)])
 def test_blind_on_recorded_data(recorded, name, seed):
     """The bound is 0.003 sample; the recordings themselves have about 0.0012 sample of jitter."""
@@ -294,6 +299,7 @@ def test_a_periodic_gain_is_not_taken_for_jitter():
     assert not bool(found.ok) or float((found["offset_samples"][:4] - true).square().mean().sqrt()) < 0.015
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("converter", [True, False])
 def test_noise_of_the_converter_is_distinguished_from_noise_with_jitter(converter: bool) -> None:
     """A tenth of the power is noise; taken for the other kind the offsets err by 12 to 15 %."""

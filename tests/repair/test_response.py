@@ -74,6 +74,7 @@ def test_known_response_is_removed_exactly(scene):
     assert set(truth) == {"r.phase_rad", "r.amplitude"}
 
 
+@pytest.mark.slow
 def test_the_reference_phase_is_estimated_and_corrected(scene):
     radar, recording = scene
     focus = OmegaK(radar, "flat")

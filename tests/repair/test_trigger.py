@@ -38,6 +38,7 @@ def test_complex_record_to_a_tenth_of_a_sample(sign, snr_db):
     assert float(error(found, trigger, radar).abs().max()) < {None: 0.05e-9, 10.0: 0.3e-9, 0.0: 1e-9}[snr_db]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", [1, -1])
 @pytest.mark.parametrize("motion_sign", [1, -1])
 def test_real_record_and_its_order(motion_sign, side):

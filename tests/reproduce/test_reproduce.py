@@ -101,6 +101,7 @@ EXPECTED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PAPERS)
 def test_reduced_forms_run(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures are drawn, but not written: that takes as long as all the rest."""

@@ -190,6 +190,7 @@ def dying_at(moment: int, out: Path, text: str) -> bool:
     os._exit(0)
 
 
+@pytest.mark.slow
 def test_dying_at_any_moment_loses_nothing(out: Path) -> None:
     """At every call that changes the disk, some of them twice in a row; the next command finishes
     what was decided, or finds the earlier result.

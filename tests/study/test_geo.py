@@ -184,6 +184,7 @@ def test_a_sweep_follows_one_target(tmp_path: Path) -> None:
         trial({key: torch.zeros(1, dtype=torch.float64) for key in both}, Draws(1, "run", [0]))
 
 
+@pytest.mark.slow
 def test_singular_speeds_are_refused_or_crossed_unharmed(tmp_path: Path) -> None:
     paper = {"stage": "alternate_velocity", "bandwidth_hz": 337.5, "aperture": VELOCITY["aperture"], "step_m_s": 2.0}
     best = channels_method(

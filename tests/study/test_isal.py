@@ -96,6 +96,7 @@ def turntable_like(folder: Path, n_pulse: int = 64, n_frequency: int = 48) -> Pa
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("made", [yak_like, turntable_like])
 def test_injected_phases_are_found_in_recordings(tmp_path: Path, made) -> None:
     tree = read_tree(find_config("autofocus_recorded"))

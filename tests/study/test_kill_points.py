@@ -157,6 +157,7 @@ def attack(home: Home, source: random.Random, seed: int) -> str:
     return f"{command} {'by time' if by_time else f'at {moment}'}{' twice' if twice else ''}: {ends}"
 
 
+@pytest.mark.slow
 def test_files_of_the_user_survive_any_kill(tmp_path: Path) -> None:
     torch.set_num_threads(1)
     home, source = Home(tmp_path), random.Random(0)

@@ -33,6 +33,7 @@ def faults(keeps: bool, folder: Path) -> tuple[str, int]:
     return kept, int(count)
 
 
+@pytest.mark.slow
 def test_pages_of_freed_tensors_are_mapped_once(tmp_path: Path):
     """In one process of ten, by the addresses that it gets, one tensor of ten is mapped anew."""
     kept, count = faults(True, tmp_path)

@@ -18,6 +18,7 @@ from torchsar.study.table import load
 from torchsar.study.trials.bench import Bench
 
 
+@pytest.mark.slow
 def test_every_ship_is_measured(tmp_path: Path) -> None:
     bench = bench_of(tmp_path, "geo_ocean")
     outcomes = bench.batch(Draws(1, "run", [0]), detail=True).outcomes
@@ -76,6 +77,7 @@ ERRORS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.slow
 def test_errors_of_clocks_and_channels_are_removed(tmp_path: Path) -> None:
     """The sea fills a Doppler band; more of them, as published, take minutes."""

@@ -61,6 +61,7 @@ def test_a_sweep_of_navigation_errors_and_noise_runs_in_one_batch(tmp_path: Path
     assert (best[:, 1] < 2e-4).all() and (best[1] < none[1]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("config", ["airborne_spotlight", "bistatic_fixed", "drone_stripmap"])
 def test_packaged_configs_work_at_reduced_size(config: str) -> None:
     small = [

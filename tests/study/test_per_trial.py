@@ -296,6 +296,7 @@ def spread(system: str, count: int) -> list[float]:
     return np.linspace(*VELOCITIES[system][1:], count).tolist()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("system", CONFIGS)
 def test_trials_of_different_velocities_share_batches_and_give_the_numbers_of_cases(
     system: str, tmp_path: Path
@@ -327,6 +328,7 @@ def numbers(tree: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, float]
             yield from numbers(value, (*path, str(key)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("system", CONFIGS)
 def test_every_number_of_the_world_that_may_differ_gives_the_data_of_cases(system: str, tmp_path: Path) -> None:
     config = loaded(system, tmp_path, RICH[system], cheap=True)
@@ -353,6 +355,7 @@ def test_a_gate_that_gives_a_sea_its_cells_makes_cases(tmp_path: Path) -> None:
     assert apart.may_differ("world.gate.duration_s") and not apart.may_differ("world.sea_gate.duration_s")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("system", CONFIGS)
 def test_a_sweep_over_velocities_costs_what_trials_of_one_velocity_cost(system: str, tmp_path: Path) -> None:
     count = 6 if system == "geo_ocean" else 32

@@ -21,6 +21,7 @@ LEEWAY = {"path_autofocus": 0.1}
 RECORDS = sorted(set((ROOT / "docs" / "sweeps").glob("*.json")) - {AUDIT})
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:at a pulse rate")
 @pytest.mark.parametrize("file", RECORDS, ids=[file.stem for file in RECORDS])
 def test_trials_of_a_record_come_out_again(file: Path) -> None:

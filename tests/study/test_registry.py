@@ -134,6 +134,7 @@ def test_a_plugin_that_cannot_be_loaded_is_a_sentence(
         registry.stages.cache_clear()
 
 
+@pytest.mark.slow
 def test_own_stage_joins_through_the_entry_point(tmp_path: Path) -> None:
     (tmp_path / "louder.py").write_text(OWN)
     info = tmp_path / "louder-1.0.dist-info"

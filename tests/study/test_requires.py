@@ -70,6 +70,7 @@ def load_system(name: str) -> Any:
     return load(next(config for (system, _), (config, _, _) in PLACES.items() if system == name), []).system
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", PLACES, ids=lambda place: "-".join(place))
 def test_auto_takes_what_the_tolerance_dictates(place: tuple[str, str]) -> None:
     """The tolerance lies just above and just below the loss of the cheapest alternatives."""
@@ -91,6 +92,7 @@ def test_auto_takes_what_the_tolerance_dictates(place: tuple[str, str]) -> None:
             assert (taken is one) <= (tolerance > loss)
 
 
+@pytest.mark.slow
 def test_what_stolt_interpolation_loses_are_the_weights_of_the_range_band() -> None:
     """A bandwidth of 30 % of the carrier and 20 degrees of squint, against the direct sum."""
     pulse = "radar.pulse={bandwidth_hz: 2.88e9, duration_s: 0.15e-6}"
@@ -110,6 +112,7 @@ def test_what_stolt_interpolation_loses_are_the_weights_of_the_range_band() -> N
     assert predicted == pytest.approx(measured, abs=0.5) and left < measured - 15
 
 
+@pytest.mark.slow
 def test_the_direct_sum_has_the_gain_over_range_of_transforms() -> None:
     """A swath of a fifth of its range: the sum grows with the range, so that images at its edges
     differed by -25 dB.
@@ -133,6 +136,7 @@ def test_auto_is_refused_where_nothing_is_to_choose() -> None:
         Bench(load("isal_corner_cubes", ["world.fidelity.kind=auto"]))  # whose pulses have no length
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("system", list(ACCURACY.FAMILIES))
 def test_predictions_agree_with_measurements(system: str) -> None:
     """On other scenes than the recorded ones: right advice, except close to the tolerance."""

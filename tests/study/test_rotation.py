@@ -27,6 +27,7 @@ def outcomes_of(folder: Path, *overrides: str, trials: int = 2, **changes: objec
     return bench, bench.batch(Draws(bench.config.seed, "run", range(trials)), detail=True).outcomes
 
 
+@pytest.mark.slow
 def test_rotations_are_found_and_images_reach_the_ideal(tmp_path: Path) -> None:
     genetic = {
         "rotation": {"stage": "entropy_rotation", "method": "genetic", **BOX, "population": 6, "generations": 3},
@@ -71,6 +72,7 @@ def test_scene_and_noise_have_seeds_of_their_own(tmp_path: Path) -> None:
     assert torch.equal(quiet[1][0], quiet[1][1])
 
 
+@pytest.mark.slow
 def test_errors_of_a_sweep_stay_above_the_bound_and_are_predicted(tmp_path: Path) -> None:
     processor = {"recommended": {"stages": {"rotation": {"stage": "uneven_rotation"}}}}
     changes = {"processor": processor, "metrics": None, "precision": "complex128"}
@@ -86,6 +88,7 @@ def test_errors_of_a_sweep_stay_above_the_bound_and_are_predicted(tmp_path: Path
         assert (predicted > 0.5 * bound).all() and (predicted[0] < 3 * bound[0]).all(), name
 
 
+@pytest.mark.slow
 def test_of_a_true_zero_there_is_no_percentage(tmp_path: Path) -> None:
     """Cases of one sweep: a constant rate has an error of k1 in 1/s, any other one in percent."""
     processor = {"recommended": {"stages": {"rotation": {"stage": "uneven_rotation"}}}}

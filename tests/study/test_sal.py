@@ -41,6 +41,7 @@ from torchsar.study.trials.bench import Bench
 pytestmark = pytest.mark.usefixtures("blank_pictures")
 
 
+@pytest.mark.slow
 def test_methods_reach_the_figures_of_a_point_also_where_the_beam_is_dark(tmp_path: Path) -> None:
     for changes in ({"world": world("sal", noise={"snr_db": None})}, {"radar": radar("sal", beam_rad=100e-6)}):
         bench = bench_of(tmp_path, "sal", **changes)
@@ -82,6 +83,7 @@ def test_a_continuous_record_is_split_by_the_trigger_that_it_tells(known: bool, 
     assert float(row["velocity_rmse_m_s"]) < 1e-3 and float(row["range_error_max_m"]) < 2e-7
 
 
+@pytest.mark.slow
 def test_trials_of_a_sweep_do_not_depend_on_their_batch_and_keep_above_bounds(tmp_path: Path) -> None:
     stages = {"segmented": SEGMENTED, "ml_peak": {"stage": "ml_peak", "window_m": WINDOW}, "recommended": MIRROR}
     alone = {name: ladar_method(stage, image=False) for name, stage in stages.items()}
@@ -190,6 +192,7 @@ def test_a_carrier_may_be_given_as_a_wavelength(tmp_path: Path) -> None:
     assert by_length.wavelength_m == pytest.approx(1.55e-6, rel=1e-15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes",
     [

@@ -64,6 +64,7 @@ def held_rows_are(held: Record, reference: Record) -> None:
             )
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:unclosed file")
 @pytest.mark.parametrize(
     "before, options, first, step", [(None, SMALL, BEFORE_LABELS, 11), (SMALL, LARGE, 0, 29)], ids=["new", "growing"]

@@ -368,6 +368,7 @@ def test_a_method_may_not_have_the_name_of_the_bounds(tmp_path: Path, capsys: py
     assert "processor.bounds: a method of a sweep cannot have this name" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "error, said",
     [

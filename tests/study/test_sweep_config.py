@@ -67,6 +67,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "result"
 
 
+@pytest.mark.slow
 def test_the_folder_holds_what_is_promised(out: Path) -> None:
     assert {p.name for p in out.iterdir() if not p.name.startswith(".")} == {
         "results.zarr",
@@ -129,6 +130,7 @@ def test_keys_of_any_kind_make_cases(load_tree) -> None:
     assert (np.abs(entropy[:, 0] - entropy[:, 1]) > 0.01).any()
 
 
+@pytest.mark.slow
 def test_the_log_says_what_is_batched(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -259,6 +261,7 @@ def test_names_of_errors() -> None:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision, tolerance", [("complex64", 1e-5), ("complex128", 1e-12)])
 def test_chunks_change_the_stripmap_chain_only_by_rounding(precision: str, tolerance: float) -> None:
     """All metrics of all methods, two noises in one batch or each alone; trials in which a choice
@@ -269,6 +272,7 @@ def test_chunks_change_the_stripmap_chain_only_by_rounding(precision: str, toler
     assert differences(records[1], records[None], tolerance) == []
 
 
+@pytest.mark.slow
 def test_the_point_estimator_of_the_stripmap_sweep_stands_on_its_bound(load_tree) -> None:
     tree = yaml.safe_load(load("stripmap_doppler", SMALL).text())
     point = {"target": {"kind": "points", "azimuth_m": [0.0], "range_m": [0.0], "random_phase": True}}

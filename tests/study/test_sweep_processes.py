@@ -91,6 +91,7 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> Record:
     return read_sweep(out)
 
 
+@pytest.mark.slow
 def test_a_program_killed_at_random_moments_loses_nothing_and_repeats_nothing(alone: Record, tmp_path: Path) -> None:
     out, log, moments = tmp_path / "s", tmp_path / "log", random.Random(7)
     kills, computed_before = 0, set()
@@ -130,6 +131,7 @@ def addresses(done: np.ndarray) -> set[tuple[str, str]]:
     return {(p.address, str(trial)) for p in points for trial in np.flatnonzero(done[p.index])}
 
 
+@pytest.mark.slow
 @needs_dask
 @pytest.mark.slow
 def test_two_workers_give_the_same_bits_and_survive_the_death_of_workers(alone: Record, tmp_path: Path) -> None:
@@ -165,6 +167,7 @@ def test_a_scheduler_that_does_not_answer_is_named() -> None:
         pytest.fail("must not begin")
 
 
+@pytest.mark.slow
 def test_an_interrupted_sweep_says_how_to_go_on_and_does(tmp_path: Path) -> None:
     config, out = (
         write_tiny(tmp_path, sweep={"world.noise.snr_db": [0.0, 10.0], "trials": 4000, "chunk": 4}),
@@ -215,6 +218,7 @@ def failing(parameters: dict, draws) -> dict:
     return {"m": parameters["nothing"]}
 
 
+@pytest.mark.slow
 @needs_dask
 def test_ctrl_c_with_workers_is_one_sentence(tmp_path: Path) -> None:
     config, out = (

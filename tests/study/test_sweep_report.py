@@ -226,10 +226,12 @@ def check_pictures(pictures: list[Picture], folder: Path, expected: list[str]) -
     assert all("95%" in p.caption for p in pictures if "_map_" not in p.files[0])
 
 
+@pytest.mark.slow
 def test_three_parameters_have_curves_shares_and_maps(drawn: tuple[Path, list[Picture]]) -> None:
     check_pictures(drawn[1], drawn[0], THREE_PARAMETERS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("labels, expected", SWEEPS.values(), ids=SWEEPS)
 def test_every_sweep_has_its_pictures(
     labels: dict[str, tuple[float | str, ...]], expected: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

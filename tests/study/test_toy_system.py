@@ -54,6 +54,7 @@ def test_it_is_short() -> None:
     assert sum(isinstance(node, ast.stmt) for node in ast.walk(tree)) <= MOST_STATEMENTS
 
 
+@pytest.mark.slow
 def test_every_command_works_on_it(
     config: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

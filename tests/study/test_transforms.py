@@ -90,6 +90,7 @@ def direction(x: Tensor) -> Tensor:
     return torch.randn(x.shape, dtype=x.dtype, generator=generator) * x.abs().square().mean().sqrt()
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:at a pulse rate")
 def test_forward_reverse_and_second_derivatives(held: Held) -> None:
     x, along = held.data, direction(held.data)
@@ -126,6 +127,7 @@ def test_a_mapped_chain_equals_the_batch(held: Held) -> None:
     assert float((mapped - together).abs().max()) < 1e-9 * float(together.abs().max())
 
 
+@pytest.mark.slow
 @torch.no_grad()
 @pytest.mark.parametrize("values", ["held", "given"])
 def test_an_exported_chain_gives_the_same_image(held: Held, values: str) -> None:
@@ -143,6 +145,7 @@ def test_an_exported_chain_gives_the_same_image(held: Held, values: str) -> None
     assert float((found - expected).abs().max()) < 1e-12 * float(expected.abs().max())
 
 
+@pytest.mark.slow
 @compiles_stages
 @torch.no_grad()
 def test_a_compiled_chain_is_one_graph(held: Held) -> None:

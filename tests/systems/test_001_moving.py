@@ -37,6 +37,7 @@ def chain(radar: BistaticRadar = RADAR, lines: bool = False) -> Chain:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speeds", [(0.0, 10.0), (10.0, 5.0), (-17.0, 14.0)])
 def test_a_target_without_prior_knowledge_is_sharp_and_without_replicas(speeds: tuple[float, float]) -> None:
     u_r, u_a = speeds
@@ -64,6 +65,7 @@ def test_a_target_without_prior_knowledge_is_sharp_and_without_replicas(speeds: 
     assert float(replica_level(profile, step_m, zones)["mfta_db"]) < -60
 
 
+@pytest.mark.slow
 def test_estimators_stand_where_the_bound_lets_them() -> None:
     # raw -30 dB
     world = BistaticWorld(MovingPoints([10.0], [0.0], [0.0], [0.0]), GATE, snr_db=-3.0)
@@ -82,6 +84,7 @@ def test_estimators_stand_where_the_bound_lets_them() -> None:
     assert 0.8 < ml < 1.3 and ati < 2.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("u_r", [25.0, -35.0])
 def test_velocities_beyond_the_ambiguity_are_found_or_warned_of(u_r: float) -> None:
     world = BistaticWorld(MovingPoints([u_r], [0.0], [0.0], [0.0]), GATE, snr_db=0.0)
@@ -99,6 +102,7 @@ def test_velocities_beyond_the_ambiguity_are_found_or_warned_of(u_r: float) -> N
     assert not bool(found.ok.any())
 
 
+@pytest.mark.slow
 def test_a_ship_leaves_the_sea_as_it_was_and_goes_to_its_place() -> None:
     sea = KSea(shape=1.5, power_db=0.0)
     ship = Ship(10.0, 0.0, 0.0, 0.0, level_db=10.0)

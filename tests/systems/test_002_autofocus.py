@@ -91,6 +91,7 @@ def test_ideal_entropy():
     assert float(image_entropy(truth.clean.signal.data).mean()) == pytest.approx(7.16, abs=0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("row, polluted", list(zip(TABLE_1, [1.26, 1.85, 2.87, 2.88], strict=True)))
 def test_polluted_entropies_are_those_of_the_reference(table_1, row, polluted):
     assert float(table_1[row]["polluted"].mean()) == pytest.approx(polluted, abs=0.2)
@@ -113,6 +114,7 @@ def test_rows_of_table_1_are_the_same_for_methods_started_from_sca(table_1, name
 # section 7: noise
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("snr_db, most", [(-5.0, 0.13), (0.0, 0.075), (10.0, 0.045), (20.0, 0.035)])
 def test_autofocus_over_snr(snr_db, most):
     """White errors: better than the entropy fixed point, itself better than PGA-SCA; its deviation
@@ -131,6 +133,7 @@ def test_autofocus_over_snr(snr_db, most):
     assert 0.5 < float(ratio.median()) < 2
 
 
+@pytest.mark.slow
 def test_far_below_the_threshold_nothing_is_claimed():
     """At -17 dB the least entropy lies at wrong phases: lower than that of the error-free image."""
     recording, truth = simulated(Aircraft(), snr_db=-17.0, trials=3)
@@ -155,6 +158,7 @@ def judged(method, scene, snr_db: float, trials: int = 4, pulses: int = 400) -> 
     return phase_rmse(found["phase_rad"], truth.values["phase_rad"]), found.ok
 
 
+@pytest.mark.slow
 def test_dense_rows_defeat_pga_sca_and_not_autofocus():
     """128 equal scatterers a row."""
     scene = SpreadRows(64, 128, 0.5, EXTENT_M, RADAR.range_step_m)
@@ -163,6 +167,7 @@ def test_dense_rows_defeat_pga_sca_and_not_autofocus():
     assert float(error.max()) < 0.1 and ok.all()
 
 
+@pytest.mark.slow
 def test_what_still_moves_is_not_believed():
     """256 scatterers a row: PGA-SCA errs by about a radian, slowly varying, and each step of the
     entropy shows little of it.
@@ -171,6 +176,7 @@ def test_what_still_moves_is_not_believed():
     assert float(error.max()) > 2 * SUCCESS_RAD and not bool((ok & (error > SUCCESS_RAD)).any())
 
 
+@pytest.mark.slow
 def test_a_target_that_fills_the_band_defeats_pairs_and_pga_and_not_autofocus():
     """4000 scatterers over the whole unambiguous cross range: adjacent pulses have nothing in
     common, so that there is nothing to start from.
@@ -183,6 +189,7 @@ def test_a_target_that_fills_the_band_defeats_pairs_and_pga_and_not_autofocus():
     assert float(error.max()) < 0.05 and ok.all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count, per_row", [(4, 1), (16, 1), (4, 4), (16, 4)])
 def test_autofocus_needs_few_rows(count, per_row):
     scene, snr_db = rows(count, per_row)
@@ -190,6 +197,7 @@ def test_autofocus_needs_few_rows(count, per_row):
     assert float(error.median()) < SUCCESS_RAD and float((ok == (error < SUCCESS_RAD)).double().mean()) >= 0.75
 
 
+@pytest.mark.slow
 def test_one_row_is_believed_only_if_it_holds_one_point():
     """Several points in one row make the modulus of its echo vary; a phase error does not."""
     for per_row in (1, 4):
@@ -200,6 +208,7 @@ def test_one_row_is_believed_only_if_it_holds_one_point():
             assert ok.all() or per_row > 1 or name not in ("entropy_fixed_point", "autofocus"), name
 
 
+@pytest.mark.slow
 def test_the_verdict_agrees_with_success():
     """Over scenes and SNR where methods succeed, fail, and nearly so: wrong claims are rare."""
     scenes = [(Aircraft(), snr) for snr in (-15.0, -8.0, 10.0)] + [
@@ -284,6 +293,7 @@ STRIPS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STRIPS)
 def test_pga_ends_near_its_best_iterate(name):
     scene, kind, start = STRIPS[name]
@@ -302,6 +312,7 @@ def test_pga_ends_near_its_best_iterate(name):
 # impairments put into any range-compressed recording
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "impairment", [WhitePhase(), PhaseWalk(0.5), PhaseSinusoid(30.0, 12.0)], ids=["white", "walk", "sinusoid"]
 )
@@ -353,6 +364,7 @@ def test_yak_42_in_flight(recorded):
     assert float(phase_rmse(by_pga["phase_rad"][1] - a, by_pga["phase_rad"][0])) > 1 and not by_pga.ok[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, most_rad", [("isar_thz_airplane_even.npz", 0.1), ("gotcha_pass1_hh_az001_003.npz", 0.2)]
 )

@@ -37,6 +37,7 @@ POINTS = {
 }
 
 
+@pytest.mark.slow
 def test_three_points_reach_the_figures_of_figs_2_and_3() -> None:
     _, made = batch("isal_rotation_points", ["ideal", "none", *POINTS], detail=True)
     figures, metrics = {n: o.judged.targets for n, o in made.outcomes.items()}, metrics_of(made)
@@ -55,6 +56,7 @@ def test_three_points_reach_the_figures_of_figs_2_and_3() -> None:
     assert abs(float(metrics["recommended"]["k1_error_percent"])) < 0.01
 
 
+@pytest.mark.slow
 def test_entropy_falls_with_the_order_and_uniform_autofocus_fails() -> None:
     methods = [
         "ideal",
@@ -82,6 +84,7 @@ def test_entropy_falls_with_the_order_and_uniform_autofocus_fails() -> None:
     assert bool(best["ok"])
 
 
+@pytest.mark.slow
 def test_corner_cubes_need_both_estimators_in_turn() -> None:
     methods = ["ideal", "none", "autofocus", "autofocus_second_order", "autofocus_third_order", "recommended"]
     _, made = batch("isal_corner_cubes", methods, trials=2)
@@ -97,6 +100,7 @@ def test_corner_cubes_need_both_estimators_in_turn() -> None:
     assert float(metrics_of(made)["recommended"]["omega_error_percent"].abs().max()) < 3
 
 
+@pytest.mark.slow
 def test_recommended_errors_stay_near_the_bound_on_new_scenes() -> None:
     bench, made = batch("isal_rotation_snr", ["recommended"], ["seed=77", "world.noise.snr_db=5.0"], trials=6)
     bounds = bench.system.bounds(bench, made)
@@ -108,6 +112,7 @@ def test_recommended_errors_stay_near_the_bound_on_new_scenes() -> None:
     assert bool(metrics_of(made)["recommended"]["ok"].all())
 
 
+@pytest.mark.slow
 def test_ignored_centre_deviation_spoils_the_rate() -> None:
     _, made = batch("isal_rotation_yc", ["ignored", "recommended"], ["world.centre_deviation_m=-3.0"], trials=2)
     assert float(metrics_of(made)["ignored"]["omega_error_percent"].abs().max()) > 10

@@ -25,6 +25,7 @@ def metrics(out: Path) -> dict:
     return json.loads((out / "metrics.json").read_text())
 
 
+@pytest.mark.slow
 def test_all_impairments_at_once(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "draw_all", lambda *_, **__: [])  # a third of the time
     tree = yaml.safe_load(find_config("stripmap_damaged").read_text(encoding="utf-8"))
@@ -43,6 +44,7 @@ def test_all_impairments_at_once(tmp_path, monkeypatch):
     assert abs(best["doppler_centroid_hz"] - found["truth"]["doppler_hz"]) < 26
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("block", "baseband_hz", "absolute_hz", "entropy_nats"),
     [("english_bay", 488, -7050, 10.018), ("squamish", 549, -6990, 11.974)],

@@ -39,6 +39,7 @@ def focused(squint_deg, reference, dtype=torch.complex64):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reference", ["matched", "flat"])
 @pytest.mark.parametrize("squint_deg", [-0.25, 0.0, 0.35])
 def test_point_targets_reach_theory(squint_deg, reference):
@@ -63,6 +64,7 @@ def test_point_targets_reach_theory(squint_deg, reference):
         assert float(((m[f"position_{axis}_m"] - truth).abs() / cell).max()) < 0.05
 
 
+@pytest.mark.slow
 def test_single_precision_image_is_within_60_db():
     _, single, _ = focused(0.35, "matched")
     _, double, _ = focused(0.35, "matched", torch.complex128)

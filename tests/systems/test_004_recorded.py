@@ -31,6 +31,7 @@ def bench(recorded):
     return table.Bench(recording, torch.tensor(-6993.0, dtype=torch.float64))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [

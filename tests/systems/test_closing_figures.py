@@ -37,6 +37,7 @@ def test_rotations_are_found_to_their_bound_at_0_db(metric: str) -> None:
     assert recorded("isal_rotation_snr", metric, 0.0, "rmse", "Cramer-Rao") == pytest.approx(1.0, abs=0.06)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("overrides", "names"),
     [
@@ -54,6 +55,7 @@ def test_false_targets_of_moving_points_stay_below_65_db(overrides: list[str], n
     assert all(float(row["ok"]) == 1 and float(row["mfta_db"]) < -65 for row in targets.values())
 
 
+@pytest.mark.slow
 def test_trials_of_a_recorded_sweep_run_again_with_that_median() -> None:
     """Six trials of the phases of a turning target at 10 dB: their median is within a tenth."""
     bench = Bench(load("isal_snr", [f"{SNR}=10.0"]))
