@@ -18,12 +18,12 @@ from torchsar.metrics.bounds import nonnegative, range_of_point
 from torchsar.radar import BistaticRadar
 from torchsar.radar.bistatic import receive_range
 
-# slant-range speed (closing positive), along-track speed, along-track position at t = 0
+# slant-range speed towards the receiver, along-track speed, and along-track position at t = 0
 UNKNOWNS = ("u_r_m_s", "u_a_m_s", "y0_m")
-# float64 rounding: eigenvalues of a correlation matrix below this count as zero
+# eigenvalues of a correlation matrix below this are float64 rounding errors and count as zero
 _SINGULAR = 1e-13
-# float64 rounding: an unknown whose squared share in an unobservable direction exceeds this has an
-# infinite bound
+# If the square of an unknown's component in an unobservable direction exceeds this limit of float64
+# rounding, its bound is infinite.
 _INVOLVED = 1e-12
 
 Value = Tensor | float
@@ -116,8 +116,9 @@ def bistatic_bounds(
 
 @dataclass(frozen=True)
 class _MovingPoint:
-    """Geometry of a point over channels and pulses, (..., channel, pulse); the values have two unit
-    dims behind the trials.
+    """Geometry of a moving point for all channels and pulses, (..., channel, pulse).
+
+    The values of the point have two dimensions of length one after the trial dimensions.
     """
 
     radar: BistaticRadar
@@ -139,21 +140,23 @@ class _MovingPoint:
         )
 
     def range_slopes(self) -> Tensor:
-        """dR_m / d(u_r, u_a, y0), (..., channel, pulse, 3)."""
+        """Derivatives of the range R_m of each channel with respect to u_r, u_a and y0, (...,
+        channel, pulse, 3).
+        """
         sine = self.along_m / self.path_m
         return torch.stack([-self.closing_m * self.time_s / self.path_m, -sine * self.time_s, -sine], -1)
 
     def phasor(self) -> Tensor:
-        """exp(-j 2 pi (R_m - R0) / lambda), complex128."""
+        """Phasors exp(-j 2 pi (R_m - R0) / lambda) of the point, complex128."""
         return unit_phasor(-self.excess_m / self.radar.wavelength_m, torch.complex128)
 
     def rectangle(self, integration_s: Tensor) -> Tensor:
-        """Rectangular gate: 1 within the integration time, else 0."""
+        """Rectangular gate: 1 within the integration time, and 0 outside."""
         inside = (self.time_s - self.y0_m / self.speed_m_s).abs() < integration_s / 2
         return inside.to(torch.float64).expand(self.along_m.shape)
 
     def pattern(self) -> Tensor:
-        """One-way amplitude pattern of the elements."""
+        """One-way amplitude pattern of a receive element."""
         return torch.sinc(self._offset())
 
     def pattern_slopes(self) -> Tensor:
@@ -177,13 +180,15 @@ class _MovingPoint:
         )
 
     def _offset(self) -> Tensor:
-        """Argument of the sinc of the pattern."""
+        """Argument of the sinc function of the antenna pattern."""
         return self.radar.element_m / self.radar.wavelength_m * self.along_m / self.path_m
 
 
 def _whitened(samples: Tensor, covariance: Tensor) -> Tensor:
-    """C^-1/2 applied over the channels of each Doppler bin of (..., channel, pulse, column); bins
-    replace pulses.
+    """Whiten (..., channel, pulse, column) over the channels in each Doppler bin.
+
+    The samples are transformed to Doppler bins and multiplied by L^-1, where L is the Cholesky
+    factor of the covariance of a bin.
     """
     spectra = torch.fft.fft(samples, dim=-2, norm="ortho").movedim(-3, -2)
     root = torch.linalg.cholesky(covariance.to(spectra))
@@ -191,8 +196,10 @@ def _whitened(samples: Tensor, covariance: Tensor) -> Tensor:
 
 
 def _information(samples: Tensor) -> Tensor:
-    """2 Re(D^H D) (..., unknown, unknown) of the columns (..., sample, 1 + unknown) after the
-    first, made orthogonal to the first.
+    """Fisher information 2 Re(D^H D) of the unknowns, (..., unknown, unknown).
+
+    The first of the columns (..., sample, 1 + unknown) is the echo of the point. D is the other
+    columns after removal of their components along the first.
     """
     point, columns = samples[..., :1], samples[..., 1:]
     energy = point.abs().square().sum(-2, keepdim=True)
@@ -203,8 +210,10 @@ def _information(samples: Tensor) -> Tensor:
 
 
 def _standard_deviations(information: Tensor) -> Tensor:
-    """Square roots of the diagonal of the inverse, (..., n, n) to (..., n); infinite for unknowns
-    with a share in an unobservable direction.
+    """Standard deviations from Fisher information (..., n, n): roots of the diagonal of its
+    inverse, (..., n).
+
+    They are infinite for unknowns with a component in an unobservable direction.
     """
     refuse_non_finite(
         information,
@@ -228,7 +237,7 @@ def _check(
     gate_tells: bool,
     covariance: Tensor | None,
 ) -> None:
-    """Raise ValueError for arguments that do not fit."""
+    """Raise ValueError for arguments that contradict each other."""
     if not unknown or len(set(unknown)) != len(unknown) or not set(unknown) <= set(UNKNOWNS):
         raise ValueError(
             f"bistatic_bounds: unknown must name some of {UNKNOWNS}, each at most once, got {tuple(unknown)}"

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from torchsar.core import Signal, host_value, level_of, power_of, unit_level
 
-# quantities that sharpness is defined for, with their power of the modulus |I|
+# quantities of which sharpness can be computed, each with its power of the modulus |I|
 _OF = {"intensity": 2, "amplitude": 1}
-# precision in which images of half precision are evaluated
+# dtype in which images of half precision are evaluated
 _WORKING = {torch.float16: torch.float32, torch.bfloat16: torch.float32, torch.complex32: torch.complex64}
 
 
@@ -55,14 +55,16 @@ def pair_of(image: Tensor | Signal, reference: Tensor | Signal) -> tuple[Tensor,
 
 
 def _power(image: Tensor) -> tuple[Tensor, Tensor]:
-    """Intensity |image|^2 and its sum over the pixels, relative to the level of each image where
-    single precision needs it, and on an accelerator, where waiting to know that takes longer.
+    """Intensity |image|^2 and its sum over the pixels.
+
+    The image is divided by its level if its intensities are too small or too large for single
+    precision. On an accelerator it always is, because reading the sum from the device takes longer.
     """
     if image.device.type == "cpu":
         power = _squares(image)
         total = _sum(power)
         least, largest = torch.aminmax(total.detach())
-        # fourth powers of single precision then neither underflow nor overflow
+        # between these limits, fourth powers in single precision neither underflow nor overflow
         lowest = 1e-12 * image.shape[-2] * image.shape[-1]
         if host_value(least, 0.0) > lowest and host_value(largest, math.inf) < 1e16:
             return power, total
@@ -71,7 +73,7 @@ def _power(image: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _squares(image: Tensor) -> Tensor:
-    """Squared moduli of the pixels."""
+    """Squared magnitudes of the pixels."""
     if not image.is_complex():
         return image.square()
     squares = torch.view_as_real(image.resolve_conj()).square()
@@ -79,8 +81,10 @@ def _squares(image: Tensor) -> Tensor:
 
 
 def _levels(image: Tensor | Signal, of: str, mask: Tensor | None, what: str) -> tuple[Tensor, Tensor | None, Tensor]:
-    """Intensities or amplitudes relative to the peak of the selected pixels, the weights of the
-    pixels in the same precision, and the weighted sum over the pixels.
+    """Intensities or amplitudes relative to the peak of the selected pixels.
+
+    Also returns the weights of the pixels in the same precision, and the weighted sum over the
+    pixels.
     """
     if of not in _OF:
         raise ValueError(f"{what} of {of!r} is not defined; choose 'intensity' or 'amplitude'")
@@ -90,7 +94,7 @@ def _levels(image: Tensor | Signal, of: str, mask: Tensor | None, what: str) -> 
         x = torch.where(weight > 0, x, 0)
     if of == "intensity":
         level, total = _power(x)
-    else:  # abs has the gradient 0 at zero, where the square root of the power has none
+    else:  # abs has the gradient 0 at zero, where the gradient of a square root is infinite
         level = unit_level(x).abs()
         total = _sum(level)
     if weight is None:
@@ -100,8 +104,8 @@ def _levels(image: Tensor | Signal, of: str, mask: Tensor | None, what: str) -> 
 
 
 def _weights(mask: Tensor, image: Tensor, what: str) -> Tensor:
-    """The mask expanded to the shape of the image; raises TypeError or ValueError for an invalid
-    mask.
+    """Expand a mask to the shape of the image; raise TypeError or ValueError for an
+    invalid mask.
     """
     if not isinstance(mask, Tensor) or mask.is_complex():
         raise TypeError(
@@ -125,8 +129,8 @@ def _weights(mask: Tensor, image: Tensor, what: str) -> Tensor:
 
 
 def _holds_weights(mask: Tensor) -> bool:
-    """Whether all values are finite and 0 or more; True inside vmap, where values cannot be
-    read.
+    """True if all values of a mask are finite and not negative, or if they cannot be read inside
+    vmap.
     """
     return mask.dtype == torch.bool or host_value(((mask >= 0) & torch.isfinite(mask)).all(), True)
 
@@ -163,9 +167,9 @@ def entropy(image: Tensor | Signal, of: str = "intensity", mask: Tensor | None =
     level, weight, total = _levels(image, of, mask, "entropy")
     tiny = torch.finfo(level.dtype).tiny
     total = total + (total == 0)
-    # -sum p ln p = ln(total / scale) - sum level ln(level / scale) / total, for any scale
+    # for any scale: -sum p ln p = ln(total / scale) - sum level ln(level / scale) / total
     scale = total.detach()
-    # ln p is finite at 0 with the derivatives that autograd needs
+    # a small number is added, so that ln p and its derivatives are finite where p is zero
     share = (level / scale[..., None, None]).add_(math.sqrt(tiny))
     summand = torch.log(share) * level if level.requires_grad else share.log_().mul_(level)
     return torch.log(total / scale) - _sum(summand, weight) / total
@@ -205,13 +209,15 @@ def contrast(image: Tensor | Signal, of: str = "intensity", mask: Tensor | None 
 
 
 def _sum(x: Tensor, weight: Tensor | None = None) -> Tensor:
-    """Weighted sum over the pixels."""
+    """Sum of the pixels of each image, with weights if they are given."""
     return (x if weight is None else x * weight).sum((-2, -1))
 
 
 def _norm(x: Tensor) -> Tensor:
-    """Square root of the energy of each image, summed in float64; in float32 the sum of a million
-    terms would lose the fourth digit, and squares could overflow. Its gradient is 0 at zeros.
+    """Square root of the energy of each image; its gradient is 0 where the image is zero.
+
+    The image is divided by its level, so that squares cannot overflow. The sum is computed in
+    float64, because float32 would lose the fourth digit in a sum of a million terms.
     """
     level = level_of(x)
     energy = power_of(x / level).sum((-2, -1), dtype=torch.float64)
@@ -304,7 +310,7 @@ def error_after_gain_db(images: Tensor, references: Tensor) -> Tensor:
         ValueError: If they are not complex images of equal size.
     """
     a, b = pair_of(images, references)
-    # one level for all images, so that the gain is common
+    # a common level of all images, since they have a common gain
     a, b = (x / level_of(x, x.ndim) for x in (a, b))
     energy = power_of(a).sum(dtype=torch.float64)
     gain = (a.conj() * b).sum(dtype=torch.complex128) / torch.where(energy == 0, 1, energy)
@@ -332,7 +338,7 @@ def rolled_to(image: Signal, reference: Signal) -> Signal:
 
 
 def _circular_centre(image: Signal, dim: int) -> float:
-    """Circular centre of the energy along one axis, in parts of the image's extent."""
+    """Circular centre of the energy along an axis, as a fraction of the extent of the image."""
     n, power = image.axes[dim].n, image.data.abs().double().square().sum(1 - dim)
     turns = torch.arange(n, dtype=torch.float64, device=power.device) / n
     return float(torch.angle(torch.polar(power, 2 * torch.pi * turns).sum())) / (2 * torch.pi)

@@ -11,18 +11,21 @@ from torch import Tensor
 
 from torchsar.core import Signal, checked_samples, cis, power_of
 
-# chosen: samples per axis of the neighbourhood in which the maximum is interpolated
+# side of the neighbourhood in which the maximum is interpolated, in samples, by choice
 _PATCH = 64
-# chosen: samples of a slice; 10 null spacings of up to 25 samples fit on either side
+# length of a slice in samples, by choice: on each side it contains 10 null spacings of up to 25
+# samples
 _SLICE = 512
-# chosen: grid points per sample of the search for the maximum, and Newton steps from the best point
+# _FINE: grid points per sample in the search for the maximum, by choice
+# _STEPS: number of Newton steps from the best grid point, by choice
 _FINE, _STEPS = 8, 2
-# points per sample of an interpolated cut
+# points per sample in an interpolated cut
 _FACTOR = 16
-# chosen: samples to either side of the peak within which a cut is interpolated; the second number
-# serves the responses that do not end within the first, and the whole cut those that end in neither
+# Numbers of samples on both sides of the peak within which a cut is interpolated, by choice.
+# The larger number is used for responses that extend beyond the smaller one. If they extend beyond
+# both, the whole cut is interpolated.
 _NEAR = (32, 128)
-# chosen: responses that are measured at once; the slices of one take a megabyte
+# number of responses that are measured at once, by choice: the slices of each take one megabyte
 _AT_ONCE = 64
 
 
@@ -120,7 +123,10 @@ def _measured(
     nulls: int,
     centre_turns: tuple[float | None, float | None],
 ) -> list[dict[str, Tensor]]:
-    """Figures along both axes of the responses nearest to samples (n,) of images (n,)."""
+    """Measure, along both axes, the response nearest to each given sample.
+
+    rows, cols: indices of the samples, (n,). image: indices of their images, (n,).
+    """
     rows, cols = _brightest(images, image, rows, cols, reach)
     rows, cols, tone_a, tone_r, da, dr = _climb(images, image, rows, cols, centre_turns)
     height, width = (min(_SLICE, n) for n in images.shape)
@@ -142,7 +148,7 @@ def _measured(
 
 
 def _nearest(index: Tensor, n: int, name: str) -> Tensor:
-    """Nearest sample of each position; raises ValueError outside the axis."""
+    """Index of the sample nearest to each position; raises ValueError outside the axis."""
     if not bool(((index >= -0.5) & (index <= n - 0.5)).all()):
         raise ValueError(
             f"at_m of impulse_response lies outside the {name} axis of {n} samples: the positions are the "
@@ -152,13 +158,13 @@ def _nearest(index: Tensor, n: int, name: str) -> Tensor:
 
 
 def _reach(search_m: float | None, step: float) -> int:
-    """Half width of the search in samples."""
+    """Half width of the search region in samples."""
     return 8 if search_m is None else max(1, math.ceil(search_m / step))
 
 
 @dataclass(frozen=True)
 class _Images:
-    """Images (image, row, column) with margins of zeros about them.
+    """Images (image, row, column) with margins of zeros on all sides.
 
     Args:
         padded: The images with their margins.
@@ -170,19 +176,22 @@ class _Images:
 
     @staticmethod
     def of(data: Tensor, reach: list[int]) -> _Images:
-        """Images with margins for slices and for a search within `reach` samples."""
-        # the maximum may lie a few samples beyond the strongest sample of the search
+        """Add margins to images, wide enough for slices and for a search within `reach` samples."""
+        # the maximum may be a few samples away from the strongest sample of the search region
         down, right = (max(_PATCH, min(_SLICE, n)) // 2 + r + 8 for n, r in zip(data.shape[-2:], reach, strict=True))
         return _Images(torch.nn.functional.pad(data, (right, right, down, down)), (down, right))
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns without the margins."""
+        """Number of rows and columns without the margins."""
         return self.padded.shape[-2] - 2 * self.margin[0], self.padded.shape[-1] - 2 * self.margin[1]
 
     def patch(self, image: Tensor, rows: Tensor, cols: Tensor, height: int, width: int) -> Tensor:
-        """Neighbourhoods (n, height, width), complex128, with the sample (rows, cols) (n,) of an
-        image (n,) at (height // 2, width // 2).
+        """Neighbourhoods of the samples (rows, cols) of the given images, (n, height, width),
+        complex128.
+
+        Each sample is at the index (height // 2, width // 2) of its neighbourhood. rows, cols and
+        image have the shape (n,).
         """
         every = self.padded.unfold(-2, height, 1).unfold(-2, width, 1)
         return every[image, rows + self.margin[0] - height // 2, cols + self.margin[1] - width // 2].to(
@@ -191,7 +200,7 @@ class _Images:
 
 
 def _brightest(images: _Images, image: Tensor, rows: Tensor, cols: Tensor, reach: list[int]) -> tuple[Tensor, Tensor]:
-    """Row and column of the strongest sample within reach of each position."""
+    """Row and column of the strongest sample in the search region about each position."""
     height, width = 2 * reach[0] + 1, 2 * reach[1] + 1
     best = images.patch(image, rows, cols, height, width).abs().flatten(-2).argmax(-1)
     return rows + best // width - reach[0], cols + best % width - reach[1]
@@ -205,9 +214,12 @@ def _climb(
     centre_turns: tuple[float | None, float | None],
     rounds: int = 3,
 ) -> tuple[Tensor, ...]:
-    """From the strongest sample to the interpolated maximum: row, column, spectral centres in turns
-    per sample, offsets in samples, (n,) each. A skewed response that is sampled finely in one axis
-    and coarsely in the other has its maximum more than a sample away from its strongest sample.
+    """Find the interpolated maximum near the strongest sample.
+
+    Returns its row and column, the spectral centres in cycles per sample along both axes, and the
+    offsets from the row and column in samples, (n,) each. The search is repeated from the new
+    sample, because the maximum of a skewed response may be more than one sample away from the
+    strongest sample. This occurs if one axis is sampled finely and the other coarsely.
     """
     found = _refined(images.patch(image, rows, cols, _PATCH, _PATCH), centre_turns)
     for _ in range(rounds):
@@ -222,8 +234,11 @@ def _climb(
 
 
 def _refined(patch: Tensor, centre_turns: tuple[float | None, float | None]) -> list[Tensor]:
-    """Spectral centres in turns per sample, and offsets of the interpolated maximum from the
-    central sample of neighbourhoods (..., row, column) in samples, shape (...,) each.
+    """Spectral centres and offsets of the interpolated maximum of neighbourhoods (..., row,
+    column).
+
+    The centres along both axes are in cycles per sample; the offsets from the central sample are in
+    samples, (...,) each.
     """
     tones = [
         _centre_turns(patch, dim)
@@ -248,8 +263,9 @@ def cut_offset(cut: Tensor, tone: Tensor) -> Tensor:
 
 
 def _centre_turns(patch: Tensor, dim: int) -> Tensor:
-    """Centre of the spectrum along dim in turns per sample, from the phase of the lag-one product,
-    (..., target).
+    """Centre of the spectrum along an axis in cycles per sample, (..., target).
+
+    It is computed from the phase of the products of adjacent samples.
     """
     n = patch.shape[dim]
     lag = (patch.narrow(dim, 1, n - 1) * patch.narrow(dim, 0, n - 1).conj()).sum((-2, -1))
@@ -257,18 +273,20 @@ def _centre_turns(patch: Tensor, dim: int) -> Tensor:
 
 
 def _distance(offset: Tensor, n: int) -> Tensor:
-    """Distances (..., n) of positions (...,), relative to sample n // 2, from all samples."""
+    """Distances (..., n) of all samples from positions (...,); these are given relative to sample n
+    // 2.
+    """
     return offset[..., None] - (torch.arange(n, dtype=torch.float64, device=offset.device) - n // 2)
 
 
 def _at_baseband(patch: Tensor, tone: Tensor, dim: int) -> Tensor:
-    """Neighbourhoods whose spectra along a dim are shifted from `tone` (...,) to zero."""
+    """Shift the spectra of neighbourhoods along an axis from the centre `tone` (...,) to zero."""
     turns = tone[..., None] * _distance(torch.zeros_like(tone), patch.shape[dim])
     return patch * cis(2 * math.pi * turns)[..., None, :].transpose(dim, -1)
 
 
 def _sinc_derivatives(x: Tensor) -> Tensor:
-    """The sinc of x (..., n) and its first two derivatives, (..., 3, n)."""
+    """Function sinc(x) and its first two derivatives for x (..., n), (..., 3, n)."""
     near = x.abs() < 1e-3
     over, squared = 1 / torch.where(near, 1, x), (math.pi * x).square()
     value = torch.sinc(x)
@@ -278,10 +296,10 @@ def _sinc_derivatives(x: Tensor) -> Tensor:
 
 
 def _fine_peak(patch: Tensor, tone_a: Tensor, tone_r: Tensor) -> tuple[Tensor, Tensor]:
-    """Offset of the interpolated maximum from the central sample along each dim in samples, (...,).
+    """Offsets of the interpolated maximum from the central sample along both axes in samples,
+    (...,) each.
 
-    The best point of a grid is refined by Newton steps on the squared modulus, which a step leaves
-    where it is not concave.
+    The best point of a grid is refined by Newton steps on the squared magnitude.
     """
     patch = _at_baseband(_at_baseband(patch, tone_a, -2), tone_r, -1)
     parts = torch.stack([patch.real, patch.imag], -3)
@@ -297,11 +315,11 @@ def _fine_peak(patch: Tensor, tone_a: Tensor, tone_r: Tensor) -> tuple[Tensor, T
 
 
 def _newton_step(jet: Tensor) -> Tensor:
-    """Newton step (2, ...) to a maximum of the squared modulus, at most half a grid step along each
-    dim; 0 where the squared modulus is not concave.
+    """Newton step (2, ...) towards a maximum of the squared magnitude.
 
-    jet: Real and imaginary part of the function and its derivatives, (..., 2, order along the
-    first dim, order along the second dim).
+    The step is at most half a grid step along each axis, and zero where the squared magnitude is
+    not concave. jet: real and imaginary part of the function and its derivatives, (..., 2, order
+    along the first axis, order along the second axis).
     """
 
     value, slope = jet[..., :1, :1], torch.stack([jet[..., 1, 0], jet[..., 0, 1]], -1)
@@ -317,7 +335,9 @@ def _newton_step(jet: Tensor) -> Tensor:
 
 
 def _slice_through(patch: Tensor, tone: Tensor, offset: Tensor, dim: int) -> Tensor:
-    """Cut (..., n) along the other dim, at a fractional offset along `dim`."""
+    """Interpolate at a fractional offset along `dim`; the result is the cut along the other axis,
+    (..., n).
+    """
     distance = _distance(offset, patch.shape[dim])
     weights = torch.sinc(distance) * cis(2 * math.pi * tone[..., None] * distance)
     return (patch @ weights[..., None])[..., 0] if dim == -1 else (weights[..., None, :] @ patch)[..., 0, :]
@@ -355,11 +375,12 @@ def cut_figures(cut: Tensor, tone: Tensor, offset: Tensor, nulls: int) -> tuple[
 
 
 def _about_zero(spectrum: Tensor, reach: int) -> Tensor:
-    """Interpolate cuts, given by their spectra (..., n), about position 0.
+    """Interpolate cuts about position 0 from their spectra (..., n).
 
     Returns `_FACTOR` points per sample at distances below `reach` samples on both sides, (..., 2
-    _FACTOR reach - 1). Where that is not the whole cut, the sum over the frequencies k is written
-    as a convolution: k m = (k^2 + m^2 - (m - k)^2) / 2 (Bluestein's chirp transform).
+    _FACTOR reach - 1). If this is only a part of the cut, Bluestein's chirp transform is used. It
+    replaces the sum over the frequencies k by a convolution, since k m = (k^2 + m^2 - (m -
+    k)^2) / 2.
     """
     n, m = spectrum.shape[-1], _FACTOR * reach - 1
     bins = torch.fft.fftshift(spectrum, dim=-1)
@@ -378,13 +399,17 @@ def _about_zero(spectrum: Tensor, reach: int) -> Tensor:
 
 
 def _chirp(index: Tensor, period: int) -> Tensor:
-    """exp(j pi index^2 / period), with the square reduced as a whole number."""
+    """Chirp exp(j pi index^2 / period); whole periods are removed from the square before
+    rounding.
+    """
     return cis(math.pi * torch.remainder(index.square(), 2 * period).to(torch.float64) / period)
 
 
 def _lobes(fine: Tensor, nulls: int) -> tuple[dict[str, Tensor], Tensor, Tensor]:
-    """Figures of interpolated cuts (..., 2 m - 1) about their peaks, the peaks, and whether the
-    cuts contain all that the figures depend on, (...,) each.
+    """Measure width and side lobes of interpolated cuts (..., 2 m - 1) whose peak is in the middle.
+
+    Also returns the values at the peaks, and True where the cut contains the whole main lobe and
+    all side lobes to be measured, (...,) each.
     """
     power = power_of(fine)
     middle = fine.shape[-1] // 2
@@ -413,8 +438,9 @@ def _lobes(fine: Tensor, nulls: int) -> tuple[dict[str, Tensor], Tensor, Tensor]
 
 
 def _crossing(side: Tensor) -> Tensor:
-    """Distance from the peak (index 0) to half its power in fine samples, by linear
-    interpolation.
+    """Distance from the peak (index 0) to half of its power, in samples of the interpolated cut.
+
+    It is found by linear interpolation of the power.
     """
     below = side < side[..., :1] / 2
     i = torch.where(below.any(-1), below.to(torch.int8).argmax(-1), side.shape[-1] - 1).clamp_min(1)
@@ -424,6 +450,6 @@ def _crossing(side: Tensor) -> Tensor:
 
 
 def _first_minimum(side: Tensor) -> Tensor:
-    """Index of the first local minimum after the peak, past the half-power point."""
+    """Index of the first local minimum of the power beyond the half-power point."""
     rising = (side[..., 1:] > side[..., :-1]) & (side[..., :-1] < side[..., :1] / 2)
     return torch.where(rising.any(-1), rising.to(torch.int8).argmax(-1), side.shape[-1] - 1)

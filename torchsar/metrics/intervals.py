@@ -12,13 +12,13 @@ import numpy as np
 
 from torchsar.core.draws import generator_at
 
-# the usual level of intervals in reports
+# usual confidence level of intervals in reports
 LEVEL = 0.95
-# the ends of 95 % intervals are then the 25th values from either end
+# with this number, the ends of 95 % intervals are the 25th smallest and 25th largest value
 RESAMPLES = 1000
 _BLOCK = 2**20  # float64 numbers in one working array: 8 MB
-_ROWS = 256  # points whose resampled sums are held at a time: 6 MB
-_COLUMNS = 512  # trials whose resampling weights are held at a time: 4 MB
+_ROWS = 256  # points whose resampled sums are in memory at once: 6 MB
+_COLUMNS = 512  # trials whose resampling weights are in memory at once: 4 MB
 
 
 def trial_statistics(values: np.ndarray, seed: int, level: float = LEVEL) -> dict[str, np.ndarray]:
@@ -139,13 +139,13 @@ def _rows(values: np.ndarray) -> np.ndarray:
 
 
 def _blocks(count: int, size: int) -> Iterator[slice]:
-    """Slices of at most `size` (at least one) that cover `count`."""
+    """Slices of at most `size` (at least one) elements that divide the range from 0 to `count`."""
     size = max(1, size)
     return (slice(start, min(start + size, count)) for start in range(0, count, size))
 
 
 def _moments(rows: np.ndarray, level: float) -> dict[str, np.ndarray]:
-    """rows: (point, trial). Everything but the bootstrap, in blocks of rows."""
+    """All statistics except bootstrap intervals, computed in blocks of rows (point, trial)."""
     table = _log_factorials(rows.shape[-1])
     parts = [_moments_of(rows[block], table, level) for block in _blocks(len(rows), _BLOCK // rows.shape[-1])]
     return (
@@ -177,18 +177,19 @@ def _moments_of(rows: np.ndarray, table: np.ndarray, level: float) -> dict[str, 
 
 
 def _scale(rows: np.ndarray) -> np.ndarray:
-    """Largest finite magnitude of each row, so that no square overflows; 1 for rows of zeros.
+    """Largest finite magnitude of each row (point, trial), and 1 for rows of zeros, (point,).
 
-    (point, trial) -> (point,).
+    Rows are divided by it, so that no square overflows.
     """
     peak = np.abs(rows).max(-1, where=np.isfinite(rows), initial=0.0)
     return np.where(peak > 0, peak, 1.0)
 
 
 def _median(ordered: np.ndarray, n: np.ndarray, table: np.ndarray, level: float) -> tuple[np.ndarray, np.ndarray]:
-    """Median (point,) and its interval (point, 2).
+    """Median (point,) and its confidence interval (point, 2).
 
-    ordered: (point, trial), ascending, NaN last; n: how many are not NaN.
+    ordered: values (point, trial) in ascending order, with NaN last. n: number of values of each
+    point that are not NaN.
     """
     rank = np.zeros_like(n)
     for count in np.unique(n):
@@ -200,11 +201,12 @@ def _median(ordered: np.ndarray, n: np.ndarray, table: np.ndarray, level: float)
 
 
 def _median_rank(n: int, table: np.ndarray, level: float) -> int:
-    """The largest r for which the r-th smallest and the r-th largest of n enclose the median with
-    the given probability; 0: none.
+    """Largest rank r for which the interval of the median has at least the given confidence.
 
-    They miss it with the probability 2 P(Binomial(n, 1/2) < r). Terms further than 5 sqrt(n) below
-    n / 2 sum to less than exp(-50).
+    The interval extends from the r-th smallest to the r-th largest of n values; the rank 0 means
+    that there is no such interval. The interval does not contain the median with the probability 2
+    P(Binomial(n, 1/2) < r). Terms more than 5 sqrt(n) below n / 2 have a sum below exp(-50) and are
+    left out.
     """
     first = max(0, math.floor(n / 2 - 5 * math.sqrt(n)))
     j = np.arange(first, n // 2)
@@ -214,9 +216,9 @@ def _median_rank(n: int, table: np.ndarray, level: float) -> int:
 
 
 def _bootstrap(rows: np.ndarray, n: np.ndarray, seed: int, level: float) -> tuple[np.ndarray, np.ndarray]:
-    """Percentile intervals of mean and rmse, (point, 2) each.
+    """Percentile intervals of the mean and of the rms value, (point, 2) each.
 
-    rows: (point, trial); n: finite trials of each.
+    rows: values (point, trial). n: number of finite trials of each point.
     """
     intervals = np.full((2, len(rows), 2), np.nan)
     enough = np.flatnonzero(n > 1)
@@ -229,11 +231,10 @@ def _bootstrap(rows: np.ndarray, n: np.ndarray, seed: int, level: float) -> tupl
 
 
 def _resampled(rows: np.ndarray, chosen: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and rmse of every resample, (resample, point) each, for the chosen rows: matrix products
-    of weights and powers.
+    """Mean and rms value of every resample, (resample, point) each, of the chosen rows.
 
-    A resample that holds none of a row's trials (there may be few among many that are missing) is
-    NaN.
+    They are computed as matrix products of the weights of the trials and the powers of the values.
+    A resample that contains none of the finite trials of a row is NaN.
     """
     sums = np.zeros((3, RESAMPLES, len(chosen)))
     scale = np.concatenate([_scale(rows[chosen[block]]) for block in _blocks(len(chosen), _BLOCK // rows.shape[-1])])
@@ -245,12 +246,12 @@ def _resampled(rows: np.ndarray, chosen: np.ndarray, seed: int) -> tuple[np.ndar
 
 
 def _weights(seed: int, trials: int) -> Iterator[tuple[slice, np.ndarray]]:
-    """How often each resample holds each trial, (resample, some trials), for one slice of trials
-    after another.
+    """Yield slices of the trials with the number of times that each resample contains each trial.
 
-    Multinomial with equal chances, drawn in two steps so that all resamples of few trials are at
-    hand together: first how many of a resample's draws fall into each slice, then where in it.
-    Addressed by (seed, trials, slice) alone.
+    The numbers (resample, trial of the slice) have a multinomial distribution with equal
+    probabilities. They are drawn in two steps, so that few trials of all resamples are in memory at
+    once. First the number of draws of each resample in each slice is drawn, then the trials within
+    a slice. The draws depend only on (seed, trials, slice).
     """
     slices = list(_blocks(trials, _COLUMNS))
     counts = generator_at(seed, "bootstrap", trials, -1).multinomial(
@@ -264,19 +265,22 @@ def _weights(seed: int, trials: int) -> Iterator[tuple[slice, np.ndarray]]:
 
 
 def _powers(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Zeroth, first and second power; zero where a trial is missing."""
+    """Zeroth, first and second power of the values; all are zero where a trial is missing."""
     here = np.isfinite(rows)
     first = np.where(here, rows, 0.0)
     return here.astype(np.float64), first, np.square(first)
 
 
 def _log_factorials(n: int) -> np.ndarray:
-    """ln(0!) .. ln(n!)."""
+    """Logarithms of the factorials, ln(0!) to ln(n!)."""
     return np.array([math.lgamma(i + 1) for i in range(n + 1)])
 
 
 def _binomial_limit(k: np.ndarray, n: np.ndarray, tail: float) -> np.ndarray:
-    """The p at which P(Binomial(n, p) >= k) equals `tail`; 0 for k = 0. k, n: (pair,) int."""
+    """Probability p at which P(Binomial(n, p) >= k) equals `tail`; 0 for k = 0.
+
+    k, n: whole numbers, (pair,).
+    """
     table = _log_factorials(int(n.max(initial=0)))
     reach = math.ceil(5 * math.sqrt(n.max(initial=0))) + 2
     parts = [_bisect(k[block], n[block], table, reach, tail) for block in _blocks(len(k), _BLOCK // reach)]
@@ -284,8 +288,9 @@ def _binomial_limit(k: np.ndarray, n: np.ndarray, tail: float) -> np.ndarray:
 
 
 def _bisect(k: np.ndarray, n: np.ndarray, table: np.ndarray, reach: int, tail: float) -> np.ndarray:
-    """Bisection between 0 and k / n, where terms further than 5 sqrt(n) above k sum to less than
-    exp(-50) (Hoeffding).
+    """Find the probability p of `_binomial_limit` by bisection between 0 and k / n.
+
+    Terms more than 5 sqrt(n) above k have a sum below exp(-50) (Hoeffding) and are left out.
     """
     j = k[:, None] + np.arange(reach)
     inside = j <= n[:, None]

@@ -19,7 +19,7 @@ Value = Tensor | float
 
 
 def _velocity_m_s(c: float, snr: Value, samples_per_sweep: Value, wavelength_m: Value, sweep_s: Value) -> Tensor:
-    """Velocity bound with the factor c of the module docstring."""
+    """Velocity bound of the module docstring for the factor c."""
     energy = nonnegative(samples_per_sweep) * nonnegative(snr)
     return nonnegative(wavelength_m) / 2 * torch.sqrt(c / energy) / (2 * math.pi * nonnegative(sweep_s))
 

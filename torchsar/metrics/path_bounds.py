@@ -12,8 +12,8 @@ from torchsar.core import gathered_checks, linear_solve, matrix_inverse, refuse_
 from torchsar.radar import LIGHT_M_S, AntennaPath
 from torchsar.radar.antenna_path import refuse_unusable
 
-# share of the trace that is added to the information about the scatterers, so that those at the
-# same position do not make it singular
+# regularisation relative to the trace: the information about scatterers at equal positions would be
+# singular
 _RIDGE = 1e-12
 
 
@@ -73,7 +73,7 @@ def line_of_sight_bound_m(
 
 
 def _unit_std_m(frequency_hz: Tensor, antennas: AntennaPath, points_m: Tensor, amplitude: Tensor) -> Tensor:
-    """The bound of one trial for noise of unit variance."""
+    """Bound for one trial and noise of unit variance."""
     pulses = antennas.pulses
     wave = frequency_hz * (2 * math.pi / LIGHT_M_S)
     amplitude = amplitude.to(torch.complex128)
@@ -83,7 +83,8 @@ def _unit_std_m(frequency_hz: Tensor, antennas: AntennaPath, points_m: Tensor, a
     for p in range(pulses):
         legs = [place[p] - points_m for place in antennas.places]
         units = [leg / torch.linalg.vector_norm(leg, dim=-1, keepdim=True) for leg in legs]
-        slope = -2 * torch.stack(units).mean(0)  # of the path by the position of the point
+        # derivative of the path with respect to the position of the scatterer
+        slope = -2 * torch.stack(units).mean(0)
         path = antennas.path_m(points_m, slice(p, p + 1))[0]
         echo = torch.exp(-1j * torch.outer(wave, path))
         moved = (-1j * wave)[:, None] * echo * amplitude
@@ -99,6 +100,7 @@ def _unit_std_m(frequency_hz: Tensor, antennas: AntennaPath, points_m: Tensor, a
     information = (torch.diag(own) - shared @ linear_solve(scene, shared.mT)) * 2
     time = torch.linspace(-1, 1, pulses, dtype=torch.float64, device=wave.device)
     line = torch.stack([torch.ones_like(time), time], -1)
-    free = torch.linalg.qr(line, mode="complete").Q[:, 2:]  # orthogonal to constant and linear terms
+    # basis of the errors that are orthogonal to constant and linear terms
+    free = torch.linalg.qr(line, mode="complete").Q[:, 2:]
     variance = matrix_inverse(free.mT @ information @ free).diagonal().sum() / pulses
     return variance.sqrt()

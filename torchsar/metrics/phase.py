@@ -66,15 +66,20 @@ def _check(what: str, *phases: Tensor) -> None:
 
 
 def _peak(z: Tensor) -> Tensor:
-    """Strongest frequency of exp(j difference), in cycles per record, on a grid of 1/8 cycle."""
+    """Frequency of the largest peak in the spectrum of z, in cycles per record, on a grid of 1/8
+    cycle.
+
+    z: phasors of the phase difference.
+    """
     n = 8 * z.shape[-1]
     at = torch.fft.fft(z.detach(), n).abs().argmax(-1).to(torch.float64)
     return torch.where(at > n / 2, at - n, at) / 8
 
 
 def _newton_step(z: Tensor, cycles: Tensor, k: Tensor) -> Tensor:
-    """One Newton step (cycles per pulse) towards the maximum of |sum z exp(-2j pi cycles k)|^2, at
-    most an eighth of a cell.
+    """One Newton step (cycles per pulse) to the maximum of |sum z exp(-2j pi cycles k)|^2.
+
+    The step is at most an eighth of a frequency cell.
     """
     turned = z * unit_phasor(-cycles[..., None] * k, torch.complex128)
     w = 2 * math.pi * k

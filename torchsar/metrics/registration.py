@@ -11,14 +11,17 @@ from torchsar.core import Signal, checked_samples, cis, unit_level
 from torchsar.focus.chirp_z import chirp_z
 from torchsar.metrics.image import error_db, pair_of
 
-# chosen: Newton steps that refine shift or slope of two images, and rounds of both in turn
+# _REFINED: number of Newton steps that refine the shift or the phase slope, by choice
+# _ROUNDS: number of repetitions in which both are refined in turn, by choice
 _REFINED, _ROUNDS = 4, 3
-# chosen: most steps of the affine registration, gain in dB below which it ends, and rows of the
-# image whose derivatives are held at once
+# _STEPS: largest number of steps of the affine registration, by choice
+# _SETTLED_DB: reduction of the error in dB below which the registration ends, by choice
+# _BLOCK_ROWS: rows of the image whose derivatives are in memory at once, by choice
 _STEPS, _SETTLED_DB, _BLOCK_ROWS = 4, 0.01, 256
-# chosen: largest rotation, stretch and shear; largest change of the shift with them in samples;
-# largest quadratic phase at the edges in turns; and share of the energy of either image that must
-# be compared
+# _MOST_LINEAR: largest rotation, stretch and shear, by choice
+# _MOST_SHIFT: largest change of the shift in samples during their fit, by choice
+# _MOST_BEND: largest quadratic phase at the edges in cycles, by choice
+# _LEAST_SHOWN: least fraction of the energy of each image in the compared pixels, by choice
 _MOST_LINEAR, _MOST_SHIFT, _MOST_BEND, _LEAST_SHOWN = 0.02, 1.0, 0.15, 0.5
 
 
@@ -77,7 +80,8 @@ def registered_error_db(image: Tensor | Signal, reference: Tensor | Signal) -> T
     first, most = map_, map_.new_tensor([_MOST_SHIFT, _MOST_LINEAR, _MOST_LINEAR])
     moved, seen = _displaced(spectrum, turns, map_)
     energy = a.abs().square().sum((-2, -1))
-    # what is compared is decided once, so that no step gains by moving pixels out of sight
+    # The compared pixels of the reference are selected before the fit. Otherwise a step could
+    # reduce the error by moving pixels out of the image.
     b = torch.where(seen, b, 0)
     hidden = torch.where(seen, moved, 0).abs().square().sum((-2, -1)) < _LEAST_SHOWN * energy
     hidden = hidden | (b.abs().square().sum((-2, -1)) < _LEAST_SHOWN * whole) | (whole == 0) | (energy == 0)
@@ -90,7 +94,7 @@ def registered_error_db(image: Tensor | Signal, reference: Tensor | Signal) -> T
         error = _error(trial_moved, b, trial_seen, trial_phase)
         small = ((trial_map - first).abs() <= most).flatten(1).all(-1)
         small = small & (trial_phase[:, 2:].abs() <= 4 * _MOST_BEND).all(-1)
-        # a trial that has settled stays, whatever the others do
+        # a registration that has converged is not changed while other trials continue
         better, done = (error < best) & small & ~done, done | ~small | (error > best - _SETTLED_DB)
         trial = trial_map, trial_phase, error, trial_moved, trial_seen
         old = map_, phase, best, moved, seen
@@ -103,18 +107,18 @@ def registered_error_db(image: Tensor | Signal, reference: Tensor | Signal) -> T
 
 
 def _from_middle(n: int, like: Tensor) -> Tensor:
-    """Places of n samples from their middle, float64 (n,)."""
+    """Distances of n samples from their middle, in samples, float64 (n,)."""
     return torch.arange(n, dtype=torch.float64, device=like.device) - (n - 1) / 2
 
 
 def _shifted(a: Tensor, b: Tensor, spectrum: Tensor, turns: list[Tensor]) -> tuple[Tensor, Tensor]:
-    """Displacement (trial, axis, 3) of image a, a shift only, and its phase (trial, 5), a slope
-    only, that register it to b.
+    """Displacement (trial, axis, 3) and phase (trial, 5) that register image a to b.
 
-    The displacement along an axis is in samples of a; its coefficients are those of 1, of the
-    azimuth and of the range sample from the middle. The coefficients of the phase, in turns, are
-    those of x, y, x^2, x y and y^2: x and y are azimuth and range from the middle, as a share of
-    the size of the image.
+    The displacement found here is only a shift, and the phase only a slope. The displacement along
+    an axis is in samples of a. Its three coefficients multiply 1, the azimuth sample and the range
+    sample, both counted from the middle. The coefficients of the phase, in cycles, are those of x,
+    y, x^2, x y and y^2. Here x and y are azimuth and range from the middle, as fractions of the
+    size of the image.
     """
     size = a.shape[-2:]
     bright = [torch.fft.fft2(x.abs().square()) for x in (a, b)]
@@ -126,7 +130,9 @@ def _shifted(a: Tensor, b: Tensor, spectrum: Tensor, turns: list[Tensor]) -> tup
     for _ in range(_ROUNDS):
         moved = torch.fft.ifft2(spectrum * _ramp(turns, shift).conj())
         common = moved * b.conj()
-        if slope is None:  # all of the image decides on the slope, not its few brightest points
+        # the first estimate of the slope uses smaller weights of bright pixels, so that few points
+        # cannot determine it
+        if slope is None:
             size_of = common.abs()
             slope = _peak(common / torch.where(size_of > 0, size_of, 1).sqrt(), place)
         slope = _peak(common, place, slope)
@@ -139,8 +145,9 @@ def _shifted(a: Tensor, b: Tensor, spectrum: Tensor, turns: list[Tensor]) -> tup
 
 
 def _displaced(spectrum: Tensor, turns: list[Tensor], map_: Tensor) -> tuple[Tensor, Tensor]:
-    """The image of a spectrum, displaced along azimuth and then along range, and the pixels whose
-    sources lie inside it.
+    """Displace the image of a spectrum along azimuth, then along range.
+
+    Also returns True for the pixels whose source positions are inside the original image.
     """
     u, v = (_from_middle(n, map_) for n in spectrum.shape[-2:])
     of_range = torch.fft.ifft(spectrum, dim=-1)  # azimuth spectra of the range lines
@@ -153,16 +160,18 @@ def _displaced(spectrum: Tensor, turns: list[Tensor], map_: Tensor) -> tuple[Ten
             map_[:, dim, 0, None, None] + map_[:, dim, 1, None, None] * u[:, None] + map_[:, dim, 2, None, None] * v
         )
         source = at + linear + (n - 1) / 2
-        # rounding may not hide the outermost pixels of an image at its place
+        # a tolerance for rounding, so that the outermost pixels of an image without displacement
+        # are used
         seen = seen & (source > -1e-6) & (source < n - 1 + 1e-6)
     return image, seen
 
 
 def _stretched(spectrum: Tensor, turns: Tensor, at: Tensor, shift: Tensor, stretch: Tensor) -> Tensor:
-    """Samples at the places `at` (1 + stretch) + shift along the last but one dimension.
+    """Samples at the positions `at` (1 + stretch) + shift along the second-last dimension.
 
-    spectrum: (trial, n, column) along that dimension; turns: (trial, n, 1); at: (n,) from the
-    middle; shift: (trial, column); stretch: (trial,). The middle of the spectrum keeps its phase.
+    spectrum: spectrum along that dimension, (trial, n, column). turns: frequencies, (trial, n, 1).
+    at: positions relative to the middle, (n,). shift: (trial, column). stretch: (trial,). The phase
+    at the middle of the spectrum is not changed.
     """
     n = len(at)
     rising, order = turns.sort(1)
@@ -187,7 +196,7 @@ def _turned(image: Tensor, phase: Tensor) -> Tensor:
 
 
 def _error(moved: Tensor, b: Tensor, seen: Tensor, phase: Tensor) -> Tensor:
-    """Error in dB of the pixels that are seen, after the best gain, (trial,)."""
+    """Error in dB of the compared pixels after multiplication by the best gain, (trial,)."""
     a = torch.where(seen, _turned(moved, phase), 0)
     energy = a.abs().square().sum((-2, -1), keepdim=True)
     gain = (a.conj() * b).sum((-2, -1), keepdim=True) / torch.where(energy == 0, 1, energy)
@@ -204,8 +213,8 @@ def _step(moved: Tensor, b: Tensor, seen: Tensor, phase: Tensor, turns: list[Ten
     along = [gain * torch.where(seen, _turned(x, phase), 0) for x in along]
     a, left = gain * a, b - gain * a
     n, m = a.shape[-2:]
-    # The coordinates are divided by the size of the image, so that the normal equations are well
-    # conditioned.
+    # coordinates are divided by the size of the image, so that the normal equations are well
+    # conditioned
     u, v = _from_middle(n, phase) / n, _from_middle(m, phase) / m
     normal, right = 0.0, 0.0
     for first in range(0, n, _BLOCK_ROWS):
@@ -219,7 +228,7 @@ def _step(moved: Tensor, b: Tensor, seen: Tensor, phase: Tensor, turns: list[Ten
         right = right + (part.mH @ left[:, rows].flatten(1)[..., None]).real
     assert isinstance(normal, Tensor) and isinstance(right, Tensor)
     level = normal.diagonal(dim1=-2, dim2=-1).amax(-1)[:, None, None]
-    # an image of one point does not determine all of them
+    # regularised, because an image of one point does not determine all coefficients
     ridge = torch.eye(normal.shape[-1], dtype=torch.float64, device=a.device) * torch.where(level > 0, 1e-9 * level, 1)
     step = torch.linalg.solve(normal + ridge, right)[..., 0]
     scale = step.new_tensor([1, n, m])
@@ -227,14 +236,15 @@ def _step(moved: Tensor, b: Tensor, seen: Tensor, phase: Tensor, turns: list[Ten
 
 
 def _ramp(turns: list[Tensor], at: list[Tensor]) -> Tensor:
-    """exp(2j pi (turns . at)), shape (..., n, m)."""
+    """Phase ramp exp(2j pi (turns . at)), (..., n, m)."""
     return cis(2 * math.pi * turns[0] * at[0]) * cis(2 * math.pi * turns[1] * at[1])
 
 
 def _peak(z: Tensor, turns: list[Tensor], start: list[Tensor] | None = None) -> list[Tensor]:
-    """Arguments d of the largest |sum z exp(2j pi turns . d)| for turns in steps of 1/n.
+    """Arguments d at which |sum z exp(2j pi turns . d)| is largest, for `turns` in steps of 1/n.
 
-    The start, if none is given, is found by an inverse FFT, and refined by Newton steps.
+    The search begins at `start`, by default at the maximum of an inverse FFT, and is refined by
+    Newton steps.
     """
     size = z.shape[-2:]
     if start is None:
@@ -256,7 +266,9 @@ def _peak(z: Tensor, turns: list[Tensor], start: list[Tensor] | None = None) -> 
 
 
 def _turns(spectrum: Tensor, dim: int) -> Tensor:
-    """Frequencies of a spectrum in turns per sample, within half a turn of its circular middle."""
+    """Frequencies of a spectrum in cycles per sample, within half a cycle of its circular
+    centre.
+    """
     n, other = spectrum.shape[dim], -3 - dim
     f = torch.fft.fftfreq(n, dtype=torch.float64, device=spectrum.device)
     power = spectrum.abs().square().sum(other)

@@ -24,14 +24,15 @@ from torchsar.metrics.bounds import range_of_point
 from torchsar.metrics.impulse import cut_figures, cut_offset
 from torchsar.radar import BistaticRadar
 
-# chosen: samples of the cut about the peak that `azimuth_response` analyses
+# length in samples of the cut about the peak that `azimuth_response` measures, by choice
 _WINDOW = 512
-# points per sample at which profiles are searched, which misses at most 0.06 dB of a peak
+# points per sample in the search for the largest value, which is at most 0.06 dB below the true
+# peak
 _OVERSAMPLED = 8
-# resolution cells added on either side of a zone: beyond them the side lobes of a replica are below
-# -30 dB of it
+# resolution cells added on both sides of a zone; beyond them the side lobes of a replica are more
+# than 30 dB below its peak
 _MARGIN_CELLS = 10
-# chosen: Doppler samples over a band at which the positions in a zone are evaluated
+# number of Doppler frequencies in a band at which the positions in a zone are computed, by choice
 _ROWS = 33
 
 Value = Tensor | float
@@ -94,14 +95,18 @@ def azimuth_response(
 
 
 def _cut(data: Tensor, centre: Tensor, width: int) -> Tensor:
-    """Samples (..., width) with `centre` at width // 2, zero outside the profile."""
+    """Samples (..., width) with `centre` at index width // 2; samples outside the profile
+    are zero.
+    """
     n = data.shape[-1]
     index = centre[..., None] + torch.arange(width, device=data.device) - width // 2
     return data.gather(-1, index.clamp(0, n - 1)) * ((index >= 0) & (index < n))
 
 
 def _tone(cut: Tensor) -> Tensor:
-    """Centre of the spectrum in turns per sample, from the phase of the lag-one product."""
+    """Centre of the spectrum in cycles per sample, from the phase of products of adjacent
+    samples.
+    """
     return torch.angle((cut[..., 1:] * cut[..., :-1].conj()).sum(-1)) / (2 * math.pi)
 
 
@@ -160,8 +165,9 @@ def replica_level(profile: Tensor, step_m: float, zones_m: Tensor, *, centre_tur
 
 
 def _oversampled(data: Tensor, centre_turns: float) -> Tensor:
-    """The profile at _OVERSAMPLED points per sample by zero padding of its spectrum, (..., n *
-    _OVERSAMPLED).
+    """Interpolate the profile to _OVERSAMPLED points per sample, (..., n * _OVERSAMPLED).
+
+    Its spectrum is centred at zero before it is padded with zeros.
     """
     n = data.shape[-1]
     turned = data * linear_phasor(
@@ -184,8 +190,10 @@ def _check_profile(profile: Tensor, what: str) -> None:
 
 @dataclass(frozen=True)
 class _Hyperbola:
-    """Spectrum of a point on a straight path: centre (Hz), image time (s), and the delay of each
-    Doppler; values have the shape (..., 1).
+    """Doppler spectrum of a point on a straight path; values have the shape (..., 1).
+
+    It gives the centre of the spectrum (Hz), the time at which the point appears in the image (s),
+    and the delay of each Doppler frequency.
     """
 
     wavelength_m: float
@@ -206,8 +214,9 @@ class _Hyperbola:
         )
 
     def curvature_s(self, doppler_hz: Tensor) -> Tensor:
-        """Delay (s) of a Doppler frequency relative to the zero-Doppler time, due to the curvature
-        of the range history; the azimuth filter removes it.
+        """Delay (s) of a Doppler frequency relative to the zero-Doppler time.
+
+        It is due to the curvature of the range history; the azimuth filter removes it.
         """
         sine = (self.wavelength_m * doppler_hz / self.speed_m_s).clamp(-0.99, 0.99)
         return -self.closest_m * sine / (self.speed_m_s * torch.sqrt(1 - sine.square()))
@@ -295,7 +304,7 @@ def replica_zones(
 
 
 def _half_band_hz(radar: BistaticRadar, point: _Hyperbola, range_m: Tensor, integration_s: Value | None) -> Tensor:
-    """Half width of the Doppler band of the point."""
+    """Half width of the Doppler band of the point (Hz)."""
     if integration_s is None:
         return point.along_m_s / radar.element_m
     return point.speed_m_s.square() * per_trial(integration_s, 1, range_m) / (2 * radar.wavelength_m * range_m)
@@ -304,8 +313,11 @@ def _half_band_hz(radar: BistaticRadar, point: _Hyperbola, range_m: Tensor, inte
 def _positions_s(
     point: _Hyperbola, assumed: _Hyperbola, half_hz: Tensor, bands: int, prf_hz: float, order: int
 ) -> Tensor:
-    """First and last image time (..., 2) of the part of the point's band that lies `order` pulse
-    rates off within the reconstructed band; its nearest edge where there is no such part.
+    """Interval of image times in which the replica of one order appears, (..., 2).
+
+    The replica comes from the part of the point's band that is `order` pulse rates away from its
+    true Doppler frequency but within the reconstructed band. If there is no such part, the nearest
+    edge of the band is used.
     """
     edge = bands * prf_hz / 2
     ends = [point.centre_hz + sign * half_hz for sign in (-1, 1)]

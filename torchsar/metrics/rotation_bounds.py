@@ -10,10 +10,10 @@ from torch import Tensor
 from torchsar.core import per_trial, refuse_non_finite
 from torchsar.radar.warp import warp
 
-# float64 rounding: eigenvalues of a correlation matrix below this count as zero
+# eigenvalues of a correlation matrix below this are float64 rounding errors and count as zero
 _SINGULAR = 1e-13
-# float64 rounding: an unknown whose squared share in an unobservable direction exceeds this has an
-# infinite bound
+# If the square of an unknown's component in an unobservable direction exceeds this limit of float64
+# rounding, its bound is infinite.
 _INVOLVED = 1e-12
 
 
@@ -122,8 +122,11 @@ def _check(cross_range_m: Tensor, range_m: Tensor, amplitude: Tensor, warp_k: Te
 
 
 def _slopes(x: Tensor, lever: Tensor, omega: Tensor, terms: int, free_centre: bool) -> Tensor:
-    """Coefficients of the curves of `_products` in the phase of each scatterer per unit of each
-    unknown, without the factor c4: (..., unknown, curve, target).
+    """Coefficients of the curves of `_products` in the phase derivatives, (..., unknown, curve,
+    target).
+
+    A derivative is that of the phase of a scatterer with respect to one unknown, without the factor
+    c4.
     """
     zero = torch.zeros_like(x * lever * omega)
     turned, bent, square = zero - x * omega, lever * omega.square() + zero, 2 * terms
@@ -134,8 +137,10 @@ def _slopes(x: Tensor, lever: Tensor, omega: Tensor, terms: int, free_centre: bo
 
 
 def _products(k: Tensor, n_pulse: int, prf_hz: float) -> Tensor:
-    """Inner products over the pulses of t^(i+1) / (i+1)!, of phi times each, and of phi^2, after
-    removal of their parts along 1 and phi, (..., curve, curve).
+    """Inner products of the curves of the phase over the pulses, (..., curve, curve).
+
+    The curves are t^i / i! for i = 2, 3, ..., then phi t^i / i!, and last phi^2. Their components
+    along 1 and phi are removed.
     """
     time = torch.arange(n_pulse, dtype=torch.float64, device=k.device) / prf_hz
     phi = warp(time, k)
@@ -150,8 +155,10 @@ def _products(k: Tensor, n_pulse: int, prf_hz: float) -> Tensor:
 
 
 def _standard_deviations(information: Tensor) -> Tensor:
-    """Square roots of the diagonal of the inverse, (..., n, n) to (..., n); infinite for unknowns
-    with a share in an unobservable direction.
+    """Standard deviations from Fisher information (..., n, n): roots of the diagonal of its
+    inverse, (..., n).
+
+    They are infinite for unknowns with a component in an unobservable direction.
     """
     refuse_non_finite(
         information,

@@ -15,11 +15,13 @@ from torch import Tensor
 
 from torchsar.core import differentiable
 
-# maps points (..., n) to costs (...,), with with_gradient=True also to gradients (..., n)
+# Function of points (..., n) that returns costs (...,).
+# With with_gradient=True it returns the gradients (..., n) as well.
 Objective = Callable[[Tensor], Any]
 
-# sufficient decrease (Armijo) and curvature (strong Wolfe) constants of the line search, the values
-# that Nocedal and Wright 2006, section 3.1, give for quasi-Newton methods
+# SUFFICIENT: constant of the condition of sufficient decrease (Armijo)
+# _CURVATURE: constant of the curvature condition (strong Wolfe)
+# The values are those that Nocedal and Wright 2006, section 3.1, give for quasi-Newton methods.
 SUFFICIENT, _CURVATURE = 1e-4, 0.9
 
 
@@ -140,7 +142,7 @@ def lbfgs(
             ended = state.active & (accepted | (line.tries >= search))
             if not bool(ended.any()):
                 continue
-            # where a line search has ended, move and start a new one
+            # trials whose line search has ended move to its result and start a new search
             not_finite = ended & ~accepted & torch.isinf(line.high.rise)
             state = _move(state, ended, not_finite, gradient_tolerance * scaled.norm, value_tolerance)
             begun = _new_search(state.cost, state.gradient, state.pairs, first_step)
@@ -235,7 +237,7 @@ def adam(
 
 
 class _Point(NamedTuple):
-    """A point (..., n), its cost and its norm of the gradient, (...,)."""
+    """A point (..., n), its cost, and the norm of the gradient there, (...,) each."""
 
     x: Tensor
     cost: Tensor
@@ -243,8 +245,8 @@ class _Point(NamedTuple):
 
 
 class _Scaled:
-    """The objective with gradients scaled per trial by the largest element of the first gradient,
-    so that no square leaves the range of the dtype.
+    """Objective with gradients divided by the largest element of the first gradient of each trial,
+    so that no square overflows or underflows in the dtype.
     """
 
     def __init__(self, objective: Objective, start: Tensor, with_gradient: bool) -> None:
@@ -258,15 +260,15 @@ class _Scaled:
         self.norm = norm(self.gradient)
 
     def __call__(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The cost (...,), the scaled gradient (..., n) and whether both are finite (...,)."""
+        """Cost (...,), scaled gradient (..., n), and True where both are finite (...,)."""
         cost, gradient = (_given if self._with_gradient else _derived)(self._objective, x)
         finite = torch.isfinite(cost) & torch.isfinite(gradient).all(-1)
         return cost, gradient / self.scale[..., None], finite
 
 
 class _Along(NamedTuple):
-    """A point of the line search: step along the direction, and rise of the cost and slope relative
-    to the slope at step 0, where the slope is -1.
+    """Point of a line search: step length, change of the cost, and slope. Both are relative to the
+    decrease per unit step at the start, so that the slope there is -1.
     """
 
     step: Tensor
@@ -275,10 +277,11 @@ class _Along(NamedTuple):
 
 
 class _Search(NamedTuple):
-    """A line search: its direction, the decrease of the cost along it per unit step, and a bracket.
+    """State of a line search: direction, decrease of the cost per unit step, and bracket.
 
-    `low` is the lowest point with sufficient decrease, with its cost and gradient; `high` is the
-    other end of the bracket, at step inf until there is one.
+    `low` is the lowest point so far with sufficient decrease; `cost` and `gradient` are those at
+    this point. `high` is the other end of the bracket; its step is infinite until a bracket is
+    found.
     """
 
     direction: Tensor
@@ -292,8 +295,9 @@ class _Search(NamedTuple):
 
 
 class _Pairs(NamedTuple):
-    """The last moves and gradient changes, (history, ..., n), newest last, and 1 / (move . change),
-    (history, ...), 0 where a slot is empty.
+    """Last moves and changes of the gradient, (history, ..., n), the newest one last.
+
+    `inverse` is 1 / (move . change), (history, ...), and 0 for an empty place.
     """
 
     move: Tensor
@@ -302,7 +306,7 @@ class _Pairs(NamedTuple):
 
 
 class _State(NamedTuple):
-    """State of `lbfgs` between two evaluations, per trial."""
+    """State of `lbfgs` between two evaluations, for all trials."""
 
     x: Tensor
     cost: Tensor
@@ -317,15 +321,15 @@ class _State(NamedTuple):
 
 
 def _probe(state: _State, scaled: _Scaled) -> tuple[_Search, Tensor]:
-    """Evaluate the next point of each line search; return the searches and whether the point is
-    accepted.
+    """Evaluate the next point of each line search.
+
+    Returns the updated state of the searches, and True where the point is accepted.
     """
     search = state.search
     cost, gradient, finite = scaled(_where(state.active, _along(state, search.step), state.x))
     rise = ((cost - state.cost) / scaled.scale).to(state.x.dtype) / search.descent
     point = _Along(search.step, torch.where(finite, rise, torch.inf), _dot(gradient, search.direction) / search.descent)
-    # near the minimum a rise of the cost by a few units of rounding is ignored, and the slope
-    # decides
+    # near the minimum, a rise of the cost by a few rounding errors is ignored
     rounding = (4 * torch.finfo(cost.dtype).eps * state.cost.abs() / scaled.scale).to(state.x.dtype) / search.descent
     low, high, step, higher, accepted = _narrow(search.low, search.high, point, rounding)
     cost, gradient = _where(higher, search.cost, cost), _where(higher, search.gradient, gradient)
@@ -335,8 +339,10 @@ def _probe(state: _State, scaled: _Scaled) -> tuple[_Search, Tensor]:
 def _narrow(
     low: _Along, high: _Along, point: _Along, rounding: Tensor
 ) -> tuple[_Along, _Along, Tensor, Tensor, Tensor]:
-    """One round of the strong Wolfe search: new ends, next step, whether the point is too high, and
-    whether it is accepted.
+    """Make one step of the strong Wolfe line search.
+
+    Returns the new ends of the bracket and the next step length. Also returns True where the cost
+    at the point is too high, and True where the point is accepted.
     """
     higher = ~(point.rise <= torch.minimum(-SUFFICIENT * point.step, low.rise) + rounding)
     accepted = ~higher & (point.slope.abs() <= _CURVATURE)
@@ -348,15 +354,16 @@ def _narrow(
 
 
 def _between(low: _Along, high: _Along) -> Tensor:
-    """Next step inside a bracket: the minimum of the cubic, kept away from the ends."""
+    """Next step length inside a bracket: the minimum of the cubic, but not close to the ends."""
     width = high.step - low.step
     part = (_cubic(low, high) - low.step) / width
-    return low.step + width * torch.where(torch.isfinite(part), part, 0.5).clamp(0.1, 1 - 0.1)  # a tenth of the bracket
+    # at least a tenth of the bracket away from its ends
+    return low.step + width * torch.where(torch.isfinite(part), part, 0.5).clamp(0.1, 1 - 0.1)
 
 
 def _beyond(low: _Along, point: _Along) -> Tensor:
-    """Next step where there is no bracket yet: 1.1 to 4 times farther, by the cubic where it has a
-    minimum.
+    """Next step length while there is no bracket: at the minimum of the cubic if it has one, but
+    between 1.1 and 4 times the last interval beyond the last point.
     """
     width = point.step - low.step
     part = (_cubic(low, point) - point.step) / width
@@ -364,7 +371,7 @@ def _beyond(low: _Along, point: _Along) -> Tensor:
 
 
 def _cubic(a: _Along, b: _Along) -> Tensor:
-    """Minimum of the cubic through two points and their slopes; NaN where it has none."""
+    """Minimum of the cubic through two points with given slopes; NaN if it has no minimum."""
     width = b.step - a.step
     bend = a.slope + b.slope - 3 * (b.rise - a.rise) / width
     root = torch.sign(width) * torch.sqrt(bend.square() - a.slope * b.slope)
@@ -372,8 +379,9 @@ def _cubic(a: _Along, b: _Along) -> Tensor:
 
 
 def _move(state: _State, ended: Tensor, not_finite: Tensor, flat_norm: Tensor, value_tolerance: float) -> _State:
-    """Move to the lowest point of each search that has ended, store the pair, and mark finished
-    trials.
+    """Move to the result of each search that has ended, and mark the trials that are finished.
+
+    The move and the change of the gradient are added to the pairs.
     """
     search = state.search
     moved = ended & (search.low.step > 0)
@@ -382,7 +390,7 @@ def _move(state: _State, ended: Tensor, not_finite: Tensor, flat_norm: Tensor, v
         _where(moved, search.cost, state.cost),
         _where(moved, search.gradient, state.gradient),
     )
-    # a gain of a few units of rounding is noise
+    # a decrease of the cost by a few rounding errors is not significant
     tolerance = max(value_tolerance, 4 * torch.finfo(cost.dtype).eps) if value_tolerance else 0.0
     lowered = state.cost - cost <= tolerance * torch.maximum(cost.abs(), state.cost.abs())
     converged = moved & ((lowered & ~not_finite) | (norm(gradient) <= flat_norm))
@@ -401,9 +409,7 @@ def _move(state: _State, ended: Tensor, not_finite: Tensor, flat_norm: Tensor, v
 
 
 def _new_search(cost: Tensor, gradient: Tensor, pairs: _Pairs, first_step: float) -> _Search:
-    """A line search at step 0 along the quasi-Newton direction, or the steepest descent if there
-    are no pairs.
-    """
+    """Start a line search along the quasi-Newton direction; without pairs, the steepest descent."""
     newton = _two_loops(gradient, pairs)
     decrease = -_dot(gradient, newton)
     usable = (pairs.inverse[-1] > 0) & torch.isfinite(decrease) & (decrease > 0)
@@ -424,7 +430,7 @@ def _new_search(cost: Tensor, gradient: Tensor, pairs: _Pairs, first_step: float
 
 
 def _two_loops(gradient: Tensor, pairs: _Pairs) -> Tensor:
-    """-H gradient by the two-loop recursion; a slot whose inverse is 0 changes nothing."""
+    """Quasi-Newton direction by the two-loop recursion; pairs with inverse 0 have no effect."""
     q, weights = -gradient, []
     for move, change, inverse in reversed(list(zip(*pairs, strict=True))):
         weights.append((inverse * _dot(move, q))[..., None])
@@ -437,7 +443,7 @@ def _two_loops(gradient: Tensor, pairs: _Pairs) -> Tensor:
 
 
 def _append(pairs: _Pairs, move: Tensor, change: Tensor, moved: Tensor) -> _Pairs:
-    """Pairs with the newest one appended where its curvature is positive beyond rounding."""
+    """Append the newest pair where its curvature is positive and larger than rounding errors."""
     curvature = _dot(move, change)
     keep = moved & (curvature > torch.finfo(move.dtype).eps * norm(move) * norm(change))
     newest = _Pairs(move, change, 1 / torch.where(keep, curvature, 1))
@@ -450,12 +456,12 @@ def _append(pairs: _Pairs, move: Tensor, change: Tensor, moved: Tensor) -> _Pair
 
 
 def _along(state: _State, step: Tensor) -> Tensor:
-    """Point at a step along the direction of the search."""
+    """Point at a given step length along the direction of the line search."""
     return state.x + step[..., None] * state.search.direction
 
 
 def _derived(objective: Objective, x: Tensor) -> tuple[Tensor, Tensor]:
-    """Cost and gradient by automatic differentiation."""
+    """Compute cost and gradient by automatic differentiation."""
     with torch.enable_grad():
         x = x.detach().requires_grad_()
         cost = objective(x)
@@ -470,7 +476,7 @@ def _derived(objective: Objective, x: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _given(objective: Objective, x: Tensor) -> tuple[Tensor, Tensor]:
-    """Cost and gradient that the objective returns itself."""
+    """Compute cost and gradient by an objective that returns both."""
     answer = objective(x)
     if not (isinstance(answer, tuple) and len(answer) == 2):
         raise TypeError(
@@ -488,14 +494,14 @@ def _given(objective: Objective, x: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _where(mask: Tensor, yes: Any, no: Any) -> Any:
-    """torch.where in every tensor of named tuples; mask (...,) also applies to tensors (..., n)."""
+    """Apply torch.where to all tensors (...,) and (..., n) of named tuples, with a mask (...,)."""
     if isinstance(yes, Tensor):
         return torch.where(mask[..., None] if yes.ndim > mask.ndim else mask, yes, no)
     return type(yes)(*(_where(mask, a, b) for a, b in zip(yes, no, strict=True)))
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
-    """Inner product over the unknowns."""
+    """Inner product of two vectors of each trial."""
     return (a * b).sum(-1)
 
 

@@ -115,7 +115,7 @@ def newton(
 
 
 class _Point(NamedTuple):
-    """A point with its cost, gradient and Hessian, and whether all are finite."""
+    """A point with its cost, gradient and Hessian, and True where all of them are finite."""
 
     x: Tensor
     cost: Tensor
@@ -125,8 +125,9 @@ class _Point(NamedTuple):
 
 
 def _evaluated(objective: Objective, x: Tensor) -> _Point:
-    """Cost, gradient and Hessian at x (..., n); since rows do not mix, the Hessians of all trials
-    take n backward passes.
+    """Compute cost, gradient and Hessian at x (..., n).
+
+    The trials are independent, so that n backward passes give the Hessians of all of them.
     """
     with torch.enable_grad():
         x = x.detach().requires_grad_()
@@ -145,20 +146,22 @@ def _evaluated(objective: Objective, x: Tensor) -> _Point:
 
 
 def _row(part: Tensor, x: Tensor) -> Tensor:
-    """One row of the Hessians; zeros where the gradient does not depend on x."""
+    """One row of the Hessian of each trial; zeros if the gradient does not depend on x."""
     row = torch.autograd.grad(part.sum(), x, retain_graph=True, allow_unused=True)[0] if part.requires_grad else None
     return torch.zeros_like(x) if row is None else row.detach()
 
 
 def _curvatures(point: _Point) -> tuple[Tensor, Tensor]:
-    """Eigenvalues (rising) and eigenvectors of the Hessian; those of zeros where it is not
+    """Eigenvalues in rising order and eigenvectors of the Hessian, or of zeros where it is not
     finite.
     """
     return torch.linalg.eigh(torch.where(point.finite[..., None, None], point.hessian, 0))
 
 
 def _step(point: _Point, damped: bool) -> Tensor:
-    """-(H + shift)^-1 gradient; not finite where the Hessian is singular to the last digit."""
+    """Newton step -(H + shift)^-1 gradient; it is not finite where the Hessian is exactly
+    singular.
+    """
     values, vectors = _curvatures(point)
     if damped:
         least = values[..., 0]
@@ -168,8 +171,10 @@ def _step(point: _Point, damped: bool) -> Tensor:
 
 
 def _shortened(objective: Objective, point: _Point, step: Tensor, active: Tensor, search: int) -> tuple[Tensor, Tensor]:
-    """Steps halved until the cost falls sufficiently, 0 where it never does, and the evaluations
-    taken.
+    """Halve the steps until the cost decreases sufficiently.
+
+    Returns the steps, which are 0 where the cost never decreases sufficiently, and the number of
+    evaluations.
     """
     slope = (point.gradient * step).sum(-1)
     rounding = 4 * torch.finfo(point.cost.dtype).eps * point.cost.abs()

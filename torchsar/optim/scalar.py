@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchsar.core import host_value, take
 
-# maps one number per trial (...,) to one cost per trial (...,)
+# function that maps one number per trial (...,) to one cost per trial (...,)
 Cost = Callable[[Tensor], Tensor]
 
 
@@ -77,7 +77,7 @@ def parabola_minimum(
             inside = vertex.abs() < 0.99
             half = torch.where(active & inside, half / 4, half)
             active = active & (half > tolerance)
-            # inside vmap values cannot be read, and all rounds are made
+            # inside vmap values cannot be read, so that no round is left out
             if not host_value(active.any(), True):
                 break
     return x, curvature

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchsar.core import Draws, differentiable, take
 
-# objective of a population: maps candidates (..., candidate, n) to costs (..., candidate)
+# objective of a population; it maps candidates (..., candidate, n) to costs (..., candidate)
 Population = Callable[[Tensor], Tensor]
 
 
@@ -193,7 +193,9 @@ def genetic(
     brood, n = population - elites, low.shape[-1]
 
     def parents(purpose: str, cost: Tensor) -> Tensor:
-        """Indices (..., brood) of the parents among candidates ranked by cost."""
+        """Select the indices (..., brood) of the parents among candidates in order of
+        their costs.
+        """
         if selection == "roulette":
             return _spun(cost, space.uniform(purpose, brood))
         drawn = space.uniform(purpose, brood, entrants)
@@ -289,7 +291,7 @@ def differential_evolution(
     history = [cost.amin(-1)]
     for generation in range(generations):
         purpose = f"evolution {generation}"
-        # three candidates for each, different from it and from each other
+        # for each candidate, three others that are all different
         order = space.uniform(f"{purpose} partners", population, population).clone()
         order.diagonal(dim1=-2, dim2=-1).fill_(torch.inf)
         base, one, other = (_pick(x, index) for index in order.argsort(-1)[..., :3].unbind(-1))
@@ -308,7 +310,9 @@ def differential_evolution(
 
 @dataclass(frozen=True)
 class _Space:
-    """Bounds of the unknowns, (*trials, 1, n) each, and the random numbers of a search in them."""
+    """Bounds of the unknowns, (*trials, 1, n) each, and the random numbers of a search between
+    them.
+    """
 
     low: Tensor
     high: Tensor
@@ -316,7 +320,9 @@ class _Space:
 
     @staticmethod
     def of(low: Tensor, high: Tensor, draws: Draws, who: str) -> _Space:
-        """Check bounds (..., n) that broadcast against each other, and the number of trials."""
+        """Make the space after a check of the bounds (..., n), which may broadcast, and of the
+        trials.
+        """
         for name, bound in (("low", low), ("high", high)):
             if not isinstance(bound, Tensor) or not bound.is_floating_point():
                 raise TypeError(
@@ -343,11 +349,13 @@ class _Space:
         return _Space(low[..., None, :], high[..., None, :], draws)
 
     def at(self, part: Tensor) -> Tensor:
-        """Points at relative coordinates (*trials, candidate, n), 0 at `low` and 1 at `high`."""
+        """Points (*trials, candidate, n) at relative coordinates: 0 is the lower bound, 1 the upper
+        one.
+        """
         return self.low + part * (self.high - self.low)
 
     def kept(self, x: Tensor) -> Tensor:
-        """Candidates with each unknown beyond a bound set to that bound."""
+        """Set each unknown of the candidates that exceeds a bound to that bound."""
         return torch.minimum(torch.maximum(x, self.low), self.high)
 
     def uniform(self, purpose: str, *shape: int) -> Tensor:
@@ -359,13 +367,16 @@ class _Space:
         return self._of_trials(self.draws.normal(purpose, shape))
 
     def _of_trials(self, x: Tensor) -> Tensor:
-        """Numbers in the dtype and with the trials of the bounds; equal ones if draws have none."""
+        """Convert random numbers to the dtype and the trials of the bounds.
+
+        All trials have the same numbers if the draws have no trials.
+        """
         trials, x = self.low.shape[:-2], x.to(dtype=self.low.dtype, device=self.low.device)
         return x.expand(*trials, *x.shape) if self.draws.trials is None else x.reshape(*trials, *x.shape[1:])
 
 
 def _costs(objective: Population, x: Tensor, who: str) -> Tensor:
-    """Costs (*trials, candidate) of candidates, without gradients; a cost of NaN becomes +inf."""
+    """Compute the costs (*trials, candidate) of candidates without gradients; NaN becomes +inf."""
     with torch.no_grad():
         cost = objective(x)
     if not isinstance(cost, Tensor) or cost.shape != x.shape[:-1] or not cost.is_floating_point():
@@ -378,7 +389,7 @@ def _costs(objective: Population, x: Tensor, who: str) -> Tensor:
 
 
 def _found(x: Tensor, cost: Tensor, history: list[Tensor], evaluations: int) -> Searched:
-    """The best of the last candidates."""
+    """Make the result of a search: the best of the last candidates."""
     index = cost.argmin(-1)
     least = take(cost, index)
     count = torch.full(least.shape, evaluations, dtype=torch.int64, device=x.device)
@@ -386,20 +397,22 @@ def _found(x: Tensor, cost: Tensor, history: list[Tensor], evaluations: int) -> 
 
 
 def _pick(x: Tensor, index: Tensor) -> Tensor:
-    """Candidates (*trials, m, n) by their indices (*trials, m)."""
+    """Select candidates (*trials, m, n) by their indices (*trials, m)."""
     return x.gather(-2, index[..., None].expand(*index.shape, x.shape[-1]))
 
 
 def _check_counts(who: str, **least: tuple[float, float]) -> None:
-    """Raise ValueError for a setting (value, minimum value) that is below its minimum."""
+    """Raise ValueError if a setting is below its minimum; each argument is (value, minimum)."""
     for name, (value, bound) in least.items():
         if not value >= bound:
             raise ValueError(f"{who}: {name} is {value}; choose at least {bound:g}")
 
 
 def _spun(cost: Tensor, drawn: Tensor) -> Tensor:
-    """Roulette: indices with probabilities proportional to the worst finite cost minus the own
-    cost; equal probabilities where no costs differ.
+    """Select indices by roulette.
+
+    The probability of a candidate is proportional to the worst finite cost minus its own cost. All
+    probabilities are equal if all costs are equal.
     """
     worst = torch.where(torch.isfinite(cost), cost, -torch.inf).amax(-1, keepdim=True)
     share = torch.where(torch.isfinite(cost), worst - cost, 0)
@@ -411,7 +424,7 @@ def _spun(cost: Tensor, drawn: Tensor) -> Tensor:
 
 
 def _points(axes: list[Tensor], sizes: list[int], number: Tensor) -> Tensor:
-    """Grid points (*trials, candidate, n) by their numbers, (*trials, candidate) or
+    """Compute grid points (*trials, candidate, n) from their numbers, (*trials, candidate) or
     (candidate,).
     """
     columns = []
@@ -422,7 +435,7 @@ def _points(axes: list[Tensor], sizes: list[int], number: Tensor) -> Tensor:
 
 
 def _checked(axes: Sequence[Tensor]) -> list[Tensor]:
-    """Detached axes; raises where one is not a finite real vector."""
+    """Detach the axes of a grid; raise an error if one is not a finite real vector."""
     if not len(axes):
         raise ValueError("grid_search: got no axes; give the values of at least one unknown")
     for i, axis in enumerate(axes):

@@ -152,7 +152,7 @@ def scatterers(
     ratio = min(max(ratio, 1 / ELONGATED), ELONGATED)
     height = min(max((ALONE - 0.9) * ratio, 1.2), HIGHEST) + BELOW
     figure, axes = new_figure(ALONE, height, aspect == "equal")
-    largest = 14 if len(x) > 20 else 40  # points of a crowded scene are small
+    largest = 14 if len(x) > 20 else 40  # the points of a scene with many points are small
     axes.scatter(x, y, s=largest * size / max(float(size.max()), 1e-300), color=COLOURS[0], linewidths=0)
     if aspect == "equal":
         middle = np.array([[x.min() + x.max(), y.min() + y.max()]]) / 2
@@ -233,20 +233,21 @@ def trade(
 
 
 def _number_points(axes: Axes, points: Sequence[tuple[float, float]]) -> None:
-    """Write the number of every point beside it, clear of other points and numbers.
+    """Write the number of every point beside it, without overlap with other points and numbers.
 
     Args:
         axes: Axes of a figure of one panel.
         points: Positions in shares of the axes.
     """
-    size = np.array([72 * 0.8 * ALONE, 72 * 0.75 * 3.6])  # of the panel in points of 1/72 inch, roughly
+    # approximate size of the panel in points of 1/72 inch
+    size = np.array([72 * 0.8 * ALONE, 72 * 0.75 * 3.6])
     at = [np.array(point) * size for point in points]
-    # directions from a point in which its number may stand
+    # directions from a point in which its number may be written
     around = ((1, 0.6), (-1, 0.6), (1, -0.6), (-1, -0.6), (0, 1.1), (0, -1.1), (1.2, 0), (-1.2, 0))
     taken = list(at)
     for i, point in enumerate(at, 1):
         beside = [np.array([9.0 * ring * x, 9.0 * ring * y]) for ring in (1, 2, 3, 4) for x, y in around]
-        # the free position that is nearest; the last one where none is
+        # nearest free position, or the last position if none is free
         offset = next((o for o in beside if all(np.hypot(*(point + o - t)) > 8.5 for t in taken)), beside[-1])
         taken.append(point + offset)
         axes.annotate(

@@ -29,7 +29,8 @@ from torchsar.plot.style import (
     wrapped_title,
 )
 
-# blocks of images per inch of a figure, fewer than pixels, so that no block is lost in drawing
+# number of averaged blocks of an image per inch of a figure; fewer than pixels, so that each block
+# is drawn
 _BLOCKS_PER_INCH = 90
 
 
@@ -64,7 +65,8 @@ def quicklook(signal: Signal, largest: int = 900) -> Signal:
     data, axes = signal.data.detach().abs(), []
     data = torch.where(torch.isfinite(data), data, torch.nan)
     peak = torch.nan_to_num(data).amax()
-    data = data / torch.where(peak > 0, peak, 1)  # squares of the amplitudes themselves may overflow
+    # divided by the peak, since squares of the amplitudes may overflow
+    data = data / torch.where(peak > 0, peak, 1)
     for dim, axis in zip((-2, -1), signal.axes, strict=True):
         step = math.ceil(axis.n / largest)
         count = axis.n // step
@@ -75,7 +77,7 @@ def quicklook(signal: Signal, largest: int = 900) -> Signal:
 
 
 def _largest(amplitude: np.ndarray) -> float:
-    """The largest finite amplitude; 0 if there is none."""
+    """Largest finite amplitude; 0 if no amplitude is finite."""
     return float(np.max(amplitude, initial=0.0, where=np.isfinite(amplitude)))
 
 
@@ -131,7 +133,7 @@ def boxes(centres: Sequence[tuple[float, float]], half_x: float, half_y: float) 
 
 
 def _extent(signal: Signal, origin: Sequence[float]) -> tuple[float, float, float, float]:
-    """Edges of an image for imshow, relative to an origin of the axes."""
+    """Edges of an image as `imshow` needs them, relative to an origin of the axes."""
     vertical, horizontal = signal.axes
     v, h = vertical.start - origin[0], horizontal.start - origin[1]
     return (
@@ -143,8 +145,9 @@ def _extent(signal: Signal, origin: Sequence[float]) -> tuple[float, float, floa
 
 
 def _to_scale(signal: Signal) -> float | None:
-    """Height over width where both axes can have one scale; None for different units or shapes
-    that are too elongated.
+    """Ratio of height to width of an image whose axes have the same scale.
+
+    None if the axes have different units or the image would be too elongated.
     """
     vertical, horizontal = signal.axes
     ratio = vertical.n * vertical.step / (horizontal.n * horizontal.step)
@@ -169,7 +172,7 @@ def level(signal: Signal, percentile: float = 100.0, width: float = PANEL) -> fl
 
 
 def _show(signal: Signal, width: float, dynamic_range_db: float, title: str, top: float, label: str) -> Figure:
-    """Draw the first trial of a signal into a new figure, to scale where that is possible."""
+    """Draw the first trial of a signal in a new figure, with equal scales if that is possible."""
     signal = _first(signal)
     view, ratio = quicklook(signal, round(_BLOCKS_PER_INCH * width)), _to_scale(signal)
     beside = 1.55  # inches for labels and the colour scale
@@ -193,13 +196,13 @@ def _show(signal: Signal, width: float, dynamic_range_db: float, title: str, top
         title=wrapped_title(title, width),
     )
     axes.grid(False)
-    # as high as the image, whatever its shape
+    # the colour scale has the height of the image
     figure.colorbar(shown, ax=axes, label=label, fraction=0.05, pad=0.02, aspect=20 * max(1.0, ratio or 1.0))
     return figure
 
 
 def _below(percentile: float) -> str:
-    """Label of a colour scale."""
+    """Label of the colour scale that names the amplitude shown as 0 dB."""
     return "dB relative to the peak" if percentile == 100 else f"dB relative to percentile {percentile:g}"
 
 
@@ -347,7 +350,7 @@ def overlays(parts: Sequence[Mapping[str, Any]], dynamic_range_db: float = 40.0)
 def _draw_over(
     figure: Figure, lines: Mapping[str, tuple[np.ndarray, np.ndarray]], ylim: tuple[float, float] | None
 ) -> None:
-    """Draw dashed lines over an image without a change of its limits."""
+    """Draw dashed lines over an image without changing the limits of the axes."""
     axes = figure.axes[0]
     limits = axes.get_xlim(), axes.get_ylim()
     for i, (name, (x, y)) in enumerate(lines.items()):

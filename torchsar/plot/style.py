@@ -22,21 +22,24 @@ from matplotlib.mathtext import MathTextParser
 from matplotlib.text import Text
 from torch import Tensor
 
-# palette by choice: text and frames, then colours of curves in their order
+# palette, by choice: colours of text and frames, and colours of curves in their order
 INK, ACCENT, SECOND, THIRD, FAINT = "#1f2933", "#0b6e99", "#d1495b", "#e09f3e", "#9aa5b1"
 COLOURS = (ACCENT, SECOND, THIRD, "#4f7942", "#6a4c93", FAINT, "#8d5524", "#1aa6a6")
-# seven markers beside eight colours: more than eight curves still differ
+# seven markers and eight colours, so that more than eight curves also differ
 MARKERS, DASHES = "osD^vPX", ("--", ":", "-.")
-# Widths in inches of a figure alone and of one panel among several. On a page 420 pixels wide,
-# which leaves 386 pixels for a figure, text of 9 points is at least 9 pixels high.
+# ALONE: width in inches of a figure that is the only one in its row
+# PANEL: width in inches of one of several panels
+# On a page 420 pixels wide, 386 pixels are left for a figure; text of 9 points is then at least 9
+# pixels high.
 ALONE, PANEL = 5.2, 3.9
-# pictures to scale become illegible when they are more elongated than this
+# largest ratio of the sides of a picture with equal scales; more elongated pictures are illegible
 ELONGATED = 4.0
-# inches below images for labels, and the largest height of an image
+# BELOW: inches below images for labels
+# HIGHEST: largest height of an image in inches
 BELOW, HIGHEST = 0.85, 4.6
-# letters of titles and legends that fit in an inch
+# number of letters of titles and legends in an inch
 _LETTERS = 11.0
-# appearance by choice
+# settings of matplotlib, by choice
 _STYLE: Any = {
     "font.size": 9,
     "axes.titlesize": 10,
@@ -60,7 +63,7 @@ _STYLE: Any = {
 
 
 class _NotebookFigure(Figure):
-    """Figure that a notebook shows by itself, without pyplot and its settings."""
+    """Figure that a notebook shows without pyplot and its settings."""
 
     def _repr_png_(self) -> bytes:
         return _png(self)
@@ -108,7 +111,7 @@ def styled(draw: Callable[..., Drawn]) -> Callable[..., Drawn]:
 
 
 def _is_formula(text: str) -> bool:
-    """Whether matplotlib can show a text as it shows formulas."""
+    """True if matplotlib can draw a text as a formula."""
     try:
         MathTextParser("path").parse(text)
     except ValueError:
@@ -185,9 +188,9 @@ def save(figure: Figure | Sequence[Figure], path: Any, dpi: int = 120, columns: 
     kind = "png" if not isinstance(path, str | PathLike) or str(path).endswith(".png") else None
     figures = [figure] if isinstance(figure, Figure) else figure
     if len(figures) == 1 and kind is None:
-        figures[0].savefig(path, dpi=dpi)  # with its vectors, where the format has them
+        figures[0].savefig(path, dpi=dpi)  # in vector graphics if the file format has them
         return
-    # savefig draws a figure with a layout twice
+    # pixels are drawn here because savefig would draw a figure with a layout twice
     drawn = [_pixels(one, dpi) for one in figures]
     rows = [drawn[first : first + columns] for first in range(0, len(drawn), columns)]
     wide = [max(row[i].shape[1] for row in rows if i < len(row)) for i in range(len(rows[0]))]
@@ -202,7 +205,7 @@ def save(figure: Figure | Sequence[Figure], path: Any, dpi: int = 120, columns: 
 
 
 def _pixels(figure: Figure, dpi: int) -> np.ndarray:
-    """A figure as colours, shape (height, width, 4)."""
+    """Draw a figure as an image of colours, (height, width, 4)."""
     figure.set_dpi(dpi)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
@@ -221,7 +224,7 @@ def array(x: Tensor) -> np.ndarray:
     return torch.as_tensor(x).detach().cpu().resolve_conj().numpy()
 
 
-# units by the last words of a name, the longest first
+# units by the last words of a name; longer endings come first
 _UNITS = {
     "_per_s2": "1/s²",
     "_per_s": "1/s",
@@ -236,7 +239,7 @@ _UNITS = {
     "_m": "m",
     "_s": "s",
 }
-# words of names that are not written in small letters
+# words of names that have capital letters
 _WRITTEN = "Doppler SNR PRF RMS RMSE IRW PSLR ISLR RCS SIR CNR SCR SCNR MFTA ADC"
 _ACRONYMS = {word.lower(): word for word in _WRITTEN.split()}
 

@@ -88,7 +88,7 @@ def _draw_bands(
     bounds: Mapping[str, np.ndarray],
     log: bool,
 ) -> None:
-    """Draw lines with bands for their intervals, and dashed bounds."""
+    """Draw lines with bands for the confidence intervals, and dashed lines for the bounds."""
     for i, (name, (y, interval)) in enumerate(series.items()):
         low, high = np.moveaxis(_drawable(interval, log), -1, 0)
         colour, line = COLOURS[i % len(COLOURS)], "-" if i < len(COLOURS) else (0, (6, 2))
@@ -113,7 +113,9 @@ def _draw_dots(
     bounds: Mapping[str, np.ndarray],
     log: bool,
 ) -> None:
-    """Draw dots with bars for their intervals over words, and dashed bounds."""
+    """Draw dots with bars for the confidence intervals at words, and dashed lines for the
+    bounds.
+    """
     step = min(0.16, 0.6 / len(series))
     for i, (name, (y, interval)) in enumerate(series.items()):
         position = np.arange(len(x)) + (i - (len(series) - 1) / 2) * step
@@ -144,23 +146,26 @@ def _draw_dots(
 
 
 def _label_words(axes: Axes, words: Sequence[str]) -> None:
-    """Write words below an axis: in lines where they fit, else slanted below a higher figure."""
+    """Write words below an axis, in several lines if they fit, else slanted.
+
+    The figure is made higher for slanted words.
+    """
     figure = axes.get_figure()
     assert isinstance(figure, Figure)
-    # twelve letters of 9 points fit in an inch below an axis
+    # twelve letters of 9 points fit in one inch below an axis
     fitting = int(12 * figure.get_figwidth() / len(words))
     filled = [textwrap.fill(word, fitting, break_long_words=False) for word in words]
     longest = [max(map(len, text.splitlines()), default=0) + 1 for text in filled]
     if all(one + other <= 2 * fitting for one, other in itertools.pairwise(longest)):
         axes.set_xticks(np.arange(len(words)), filled)
         return
-    # each letter of a slanted word needs a twentieth of an inch
+    # a slanted word needs a twentieth of an inch of height per letter
     figure.set_figheight(figure.get_figheight() + 0.05 * max(map(len, words)))
     axes.set_xticks(np.arange(len(words)), words, rotation=40, ha="right")
 
 
 def _scale_axes(axes: Axes, x: np.ndarray, log_x: bool, log_y: bool, ylim: tuple[float, float]) -> None:
-    """Set scales, ticks and limits."""
+    """Set the scales, the ticks and the limits of the axes."""
     if x.dtype.kind != "U":
         axes.set_xscale("log" if log_x else "linear")
         position = np.log(x) if log_x else x
@@ -227,12 +232,12 @@ def _norm(z: np.ndarray, log: bool) -> Normalize:
 
 
 def _label_cells(axes: Axes, part: Mapping[str, Any], z: np.ndarray, norm: Normalize) -> None:
-    """Set ticks at values of the parameters and, for few cells, write their numbers."""
+    """Set ticks at values of the parameters, and write the value into each of few cells."""
     for axis, values in ((axes.xaxis, part["x"]), (axes.yaxis, part["y"])):
         step = math.ceil(len(values) / 8)
         axis.set_ticks(np.arange(0, len(values), step), [f"{value:g}" for value in values[::step]])
     axes.grid(False)
-    if z.size <= 48 and z.shape[1] <= 7:  # so that the numbers fit into a panel
+    if z.size <= 48 and z.shape[1] <= 7:  # only then the numbers fit into the cells
         for (row, column), value in np.ndenumerate(z):
             if np.isfinite(value):
                 axes.text(

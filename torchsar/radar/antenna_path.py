@@ -82,7 +82,7 @@ class AntennaPath:
     @property
     def trials(self) -> torch.Size:
         """Leading dimensions."""
-        # the function of torch imports sympy at its first call, which takes half a second
+        # torch.broadcast_shapes imports sympy at its first call, which takes half a second
         shapes = self.reference_m.shape[:-1], *(place.shape[:-2] for place in self.places)
         return torch.Size(np.broadcast_shapes(*shapes))
 

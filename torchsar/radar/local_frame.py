@@ -11,8 +11,8 @@ from torch import Tensor
 from torchsar.radar.antenna_path import refuse_unusable
 from torchsar.radar.orbit import EARTH_RADIUS_M
 
-FLATTENING = 1 / 298.257223563  # of the ellipsoid of WGS 84
-# square of its first eccentricity
+FLATTENING = 1 / 298.257223563  # flattening of the ellipsoid of WGS 84
+# square of the first eccentricity of the ellipsoid
 _ECCENTRICITY2 = FLATTENING * (2 - FLATTENING)
 
 
@@ -125,7 +125,7 @@ class LocalFrame:
     def _axes(self, name: str, like: Tensor) -> tuple[Tensor, Tensor]:
         """Geocentric position of the origin, and unit vectors east, north and up, (3, 3).
 
-        Raises an error unless the positions are finite float64 of shape (..., 3).
+        Raises an error unless `like` holds finite float64 positions of shape (..., 3).
         """
         refuse_unusable(**{name: like})
         if like.shape[-1:] != (3,):

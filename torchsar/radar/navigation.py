@@ -76,9 +76,10 @@ def resample_path(
 
 
 def _refuse_times(time: Tensor, first: Tensor, last: Tensor) -> None:
-    """Raise ValueError unless times rise, and pulses lie within the record.
+    """Raise ValueError unless times rise and the pulses are within the record.
 
-    Pulses may lie beyond the record by a millionth of the median interval, for rounding errors.
+    A pulse may be outside the record by a millionth of the median interval, because of rounding
+    errors.
     """
     bad = time.diff() <= 0
     if bool(bad.any()):
@@ -106,10 +107,10 @@ def _refuse_times(time: Tensor, first: Tensor, last: Tensor) -> None:
 
 
 def _refuse_gaps(time: Tensor, first: Tensor, last: Tensor, longest_gap_s: float | None) -> None:
-    """Raise ValueError if an interval among the pulses is too long.
+    """Raise ValueError if an interval of the record is too long during the pulses.
 
-    By choice, that is ten median intervals, and five times what 95 % do not exceed: the longest of
-    1000 random intervals is about ten times the median.
+    By choice, an interval is too long if it exceeds both ten median intervals and five times the
+    95 % quantile. The longest of 1000 random intervals is about ten times the median.
     """
     step = time.diff()
     if longest_gap_s is None:
@@ -128,26 +129,27 @@ def _refuse_gaps(time: Tensor, first: Tensor, last: Tensor, longest_gap_s: float
 
 
 def _refuse_jumps(time: Tensor, position: Tensor, first: Tensor, last: Tensor, jump_m: float) -> None:
-    """Raise ValueError if positions jump among the pulses."""
-    t = time.unfold(-1, 5, 1)  # (..., window, 5)
+    """Raise ValueError if recorded positions jump during the pulses."""
+    t = time.unfold(-1, 5, 1)  # windows of five times, (..., window, 5)
     mean_step = (t[..., -1] - t[..., 0]) / 4
     away = (t[..., :, None] - t[..., None, :]) / mean_step[..., None, None]
     weight = 1 / (away + torch.eye(5, dtype=torch.float64, device=time.device)).prod(-1)
     weight = weight / torch.linalg.vector_norm(weight, dim=-1, keepdim=True)
-    # the weights have a sum of zero; without the common offset nothing is rounded
+    # the weights have a sum of zero; the common offset is subtracted to avoid rounding errors
     offset = position.unfold(-2, 5, 1) - position[..., 2:-2, :, None]  # (..., window, 3, 5)
     residual = torch.linalg.vector_norm((offset * weight[..., None, :]).sum(-1), dim=-1)
-    # Normalised fourth differences at equal steps: 3 / sqrt(70) of a jump of 1 in the middle, and
-    # h^2 / 12 of an acceleration that sets in between two records, by choice about that of gravity.
+    # Effects on a normalised fourth difference at equal steps h: a jump of 1 in the middle gives
+    # 3 / sqrt(70). An acceleration that begins between two records gives its value times h^2 / 12;
+    # by choice, about that of gravity is accepted.
     of_jump = 0.36
     limit = torch.maximum(10.0 / 12 * mean_step.square(), mean_step.new_tensor(of_jump * jump_m))
-    # What is left of smooth motion grows with the fourth power of the interval. By choice a jump
-    # exceeds the median of the residuals ten times; normal noise has up to 4.
+    # The residual of smooth motion grows with the fourth power of the interval. By choice, a jump
+    # is ten times the median of the residuals; normal noise has up to 4.
     longer = (mean_step / mean_step.median(-1, keepdim=True).values).clamp_min(1) ** 4
     limit = torch.maximum(limit, 10 * longer * residual.median(-1, keepdim=True).values)
     bad = (residual > limit) & (t[..., -1] > first[..., None]) & (t[..., 0] < last[..., None])
     if bool(bad.any()):
-        # the middle of the window that it disturbs most
+        # time in the middle of the window with the largest residual
         at, where = _first(bad & (residual == torch.where(bad, residual, 0).amax(-1, keepdim=True)))
         size, most, when = (float(x.expand(bad.shape)[at]) for x in (residual, limit, t[..., 2]))
         raise ValueError(
@@ -157,7 +159,7 @@ def _refuse_jumps(time: Tensor, position: Tensor, first: Tensor, last: Tensor, j
 
 
 def _first(bad: Tensor) -> tuple[tuple[int, ...], str]:
-    """Index of the first entry that is True, and the trial it belongs to as text."""
+    """Index of the first entry that is True, and a text that names its trial."""
     at = tuple(int(i) for i in bad.nonzero()[0])
     trial = at[0] if len(at) == 2 else at[:-1]
     return at, f" in trial {trial}" if len(at) > 1 else ""

@@ -101,7 +101,9 @@ class Orbit:
         )
 
     def _turned(self, perigee: Tensor, ahead: Tensor) -> Tensor:
-        """Rotate in-plane components (..., time) to the inertial frame (..., time, 3)."""
+        """Rotate components in the orbital plane (..., time) to the inertial frame (...,
+        time, 3).
+        """
         argument, tilt, node = (
             _radians(x, perigee) for x in (self.argument_of_perigee_deg, self.inclination_deg, self.raan_deg)
         )
@@ -135,7 +137,7 @@ def eccentric_anomaly(mean_rad: Tensor, eccentricity: Tensor) -> Tensor:
 
     with torch.no_grad():
         solution = mean_rad + eccentricity * torch.sin(mean_rad)
-        # as many for all trials; seven reach 1e-15 rad at eccentricity 0.9
+        # the same number of steps for all trials; seven reach 1e-15 rad at the eccentricity 0.9
         for _ in range(30):
             solution = stepped(solution)
     return stepped(solution)
@@ -241,7 +243,7 @@ def power_series(series: Sequence[Tensor], power: float) -> list[Tensor]:
 
 
 def _dot_series(series: Sequence[Tensor]) -> list[Tensor]:
-    """Return the Taylor coefficients (..., 1) of the squared length of a vector."""
+    """Taylor coefficients (..., 1) of the squared length of a vector, from those of the vector."""
     return [
         sum(
             ((series[k] * series[n - k]).sum(-1, keepdim=True) for k in range(n + 1)),

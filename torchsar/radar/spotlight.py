@@ -85,8 +85,8 @@ def frequency_step_hz(frequency_hz: Tensor) -> float:
             f"frequency_hz must be two or more positive numbers (n,), got {f.dtype} of shape {tuple(f.shape)}"
         )
     step, steps = float(f[-1] - f[0]) / (f.shape[0] - 1), f.diff()
-    # stored frequencies are rounded, by 6e-4 of a step in the GOTCHA recording; 1 % of a step still
-    # rejects a missing or repeated frequency
+    # Stored frequencies are rounded, by 6e-4 of a step in the GOTCHA recording. A limit of 1 % of a
+    # step still detects a missing or repeated frequency.
     if not (step > 0 and float((steps - step).abs().max()) <= 0.01 * step):
         raise ValueError(
             f"frequency_hz must rise in equal steps, got steps of {float(steps.min()):g} to "
@@ -97,10 +97,10 @@ def frequency_step_hz(frequency_hz: Tensor) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Geometry:
-    """Base class of geometries: frequencies, and a vector and a range for each pulse.
+    """Base class of geometries with frequencies, and with a vector and a range for each pulse.
 
-    Subclasses name the fields of the vectors (pulse, 2 or 3) and of the ranges (pulse,) in
-    `_names`, and give the length of a vector.
+    In `_names`, subclasses give the names of the fields with the vectors (pulse, 2 or 3) and with
+    the ranges (pulse,), and in `_dims` the length of a vector.
     """
 
     frequency_hz: Tensor

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchsar.core import ArrayFile
 from torchsar.radar.local_frame import LocalFrame, geocentric
 
-# columns by the names that programs give them, in lower case and without unit
+# accepted names of the columns, in lower case and without unit
 _NAMES = {
     "time": "t time timestamp seconds sec gps_time gpstime gps_seconds tow utc",
     "x": "x east easting e pos_x x_enu",
@@ -25,7 +25,7 @@ _NAMES = {
     "longitude": "lon long lng longitude lambda",
     "height": "h height alt altitude ellipsoidal_height elevation hgt",
 }
-# factors of units that may stand behind a name, as in time_ms, x (km) or lat[deg]
+# accepted units after a name, as in time_ms, x (km) or lat[deg], with their factors
 _UNITS = {
     **{"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "m": 1.0, "km": 1e3, "cm": 1e-2, "mm": 1e-3},
     **{"ft": 0.3048, "deg": 1.0, "rad": 180 / np.pi},
@@ -149,7 +149,7 @@ def read_table(path: Path) -> dict[str, np.ndarray]:
         lines = [line.strip() for line in path.read_text("utf-8-sig").splitlines() if line.strip()]
     except UnicodeDecodeError:
         raise ValueError(f"{path} is no table of numbers in text") from None
-    decimal = "," if lines and ";" in lines[-1] else "."  # as tables of some countries have it
+    decimal = "," if lines and ";" in lines[-1] else "."  # decimal comma of some countries
     mark = next((mark for mark in (";", ",", "\t") if lines and mark in lines[-1]), None)
     rows, names = [], []
     for number, line in enumerate(lines, 1):
@@ -173,12 +173,12 @@ def read_table(path: Path) -> dict[str, np.ndarray]:
 
 
 def _numbered(table: np.ndarray) -> dict[str, np.ndarray]:
-    """Columns of a table without names, by their numbers."""
+    """Columns of a table without names; their keys are their numbers."""
     return {} if table.ndim != 2 else dict(zip(map(str, range(table.shape[1])), table.T))
 
 
 def _value(cell: str) -> float:
-    """The number in a cell, in seconds where it is a date; an empty cell is NaN."""
+    """Number in a cell; a date is converted to seconds, and an empty cell to NaN."""
     if not cell:
         return float("nan")
     try:
@@ -190,7 +190,10 @@ def _value(cell: str) -> float:
 
 
 def _known(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Columns by the names of `_NAMES`, in seconds, metres and degrees; others as they are."""
+    """Rename columns to the names of `_NAMES` and convert them to seconds, metres and degrees.
+
+    Columns with other names are not changed.
+    """
     found: dict[str, np.ndarray] = {}
     for name, values in columns.items():
         text = name.strip().lower()

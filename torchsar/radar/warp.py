@@ -137,7 +137,7 @@ def k_of_shape(shape: Tensor, duration_s: float) -> Tensor:
     """
     order = shape.shape[-1] + 1
     half = duration_s / 2
-    # rows: monomials in s + 1 = t / half of P1, P2, ...
+    # each row: coefficients of one polynomial P1, P2, ... in powers of s + 1 = t / half
     rows = _on(
         shape,
         np.stack(
@@ -156,13 +156,15 @@ def k_of_shape(shape: Tensor, duration_s: float) -> Tensor:
 
 
 def _monomials(polynomial: np.polynomial.Polynomial, order: int) -> np.ndarray:
-    """Coefficients of (s + 1)^1 to (s + 1)^order."""
+    """Coefficients of a polynomial for the powers (s + 1)^1 to (s + 1)^order."""
     shifted = polynomial(np.polynomial.Polynomial([-1.0, 1.0])).coef
     return np.pad(shifted, (0, order + 1 - len(shifted)))[1:]
 
 
 def _legendre_of(k: Tensor, duration_s: float) -> tuple[Tensor, Tensor]:
-    """Legendre coefficients 0..order of t, and of t^(i + 1) / (i + 1)! for each k_i."""
+    """Legendre coefficients of degree 0 to `order` of t, and of t^(i + 1) / (i + 1)! for
+    each k_i.
+    """
     order, half = k.shape[-1] + 1, duration_s / 2
 
     def row(power: int) -> np.ndarray:
@@ -175,7 +177,7 @@ def _legendre_of(k: Tensor, duration_s: float) -> tuple[Tensor, Tensor]:
 
 
 def _on(like: Tensor, values: np.ndarray) -> Tensor:
-    """Values as a tensor with the dtype and device of another one."""
+    """Convert values to a tensor with the dtype and the device of another one."""
     return torch.as_tensor(values, dtype=like.dtype, device=like.device)
 
 

@@ -66,7 +66,7 @@ class LinearFM:
         """
         if not 0 < sampling_hz < math.inf:
             raise ValueError(f"sampling_hz must be positive and finite, got {sampling_hz}")
-        # a product that is above a whole number by rounding is that number
+        # a product above a whole number only by rounding counts as this number
         return max(1, math.ceil(self.duration_s * sampling_hz * (1 - 1e-12)))
 
     def samples(
@@ -95,7 +95,7 @@ class LinearFM:
             )
 
     def _refuse_short(self, n: int, sampling_hz: float) -> None:
-        """Raise ValueError for range lines that are shorter than the pulse."""
+        """Raise ValueError for range lines shorter than the pulse."""
         if n < self.n_samples(sampling_hz):
             raise ValueError(
                 f"a line of {n} samples does not hold the pulse of {self.n_samples(sampling_hz)} samples; "
@@ -140,13 +140,14 @@ class LinearFM:
             ValueError: If a range line of n samples is shorter than the pulse.
         """
         self._refuse_short(n, sampling_hz)
-        finer, duration = 16, self.duration_s  # chosen: fine samples per sample, from which the spectrum is computed
+        # by choice: number of fine samples per sample, from which the spectrum is computed
+        finer, duration = 16, self.duration_s
         rate = finer * sampling_hz
         t = torch.arange(math.ceil(duration * rate * (1 - 1e-12)) + 1, dtype=torch.float64, device=device) / rate
-        # each fine sample stands for the part of the pulse within half a step of it
+        # weight of a fine sample: length of the pulse within half a fine step on both sides
         inside = (t + 0.5 / rate).clamp(max=duration) - (t - 0.5 / rate).clamp(min=0)
         fine = unit_phasor(0.5 * self.rate_hz_s * (t - duration / 2).square(), torch.complex128) * inside.clamp(min=0)
         whole = torch.fft.fft(fine, finer * n) * sampling_hz
         band = torch.cat([whole[: n - n // 2], whole[whole.numel() - n // 2 :]])
-        # the averaging over a step attenuates the edges of the band
+        # corrects the attenuation of the band edges by averaging over a fine step
         return band / torch.sinc(torch.fft.fftfreq(n, dtype=torch.float64, device=device) / finer)
