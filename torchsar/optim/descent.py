@@ -15,13 +15,11 @@ from torch import Tensor
 
 from torchsar.core import differentiable
 
-# Function of points (..., n) that returns costs (...,).
-# With with_gradient=True it returns the gradients (..., n) as well.
+# function of points (..., n) that returns costs, or with with_gradient=True costs and gradients
 Objective = Callable[[Tensor], Any]
 
-# SUFFICIENT: constant of the condition of sufficient decrease (Armijo)
-# _CURVATURE: constant of the curvature condition (strong Wolfe)
-# The values are those that Nocedal and Wright 2006, section 3.1, give for quasi-Newton methods.
+# constants of sufficient decrease (Armijo) and curvature (strong Wolfe) for quasi-Newton methods
+# according to Nocedal and Wright 2006, section 3.1
 SUFFICIENT, _CURVATURE = 1e-4, 0.9
 
 
