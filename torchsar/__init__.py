@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from torchsar.study.memory import keep_freed_memory
 
 __version__ = "0.1.0"
-# subpackages that are no part of the public face: what they need is not always installed
+# subpackages outside `__all__`, because some need packages that are not always installed
 _ON_REQUEST = ("data", "datasets", "optim", "plot", "reproduce", "study")
 
 __all__ = [

@@ -4,5 +4,5 @@ import sys
 
 from torchsar.cli import main
 
-if __name__ == "__main__":  # tests and tools import every module of the package
+if __name__ == "__main__":  # tests and tools import every module, which must not run the command
     sys.exit(main())

@@ -18,9 +18,9 @@ from pathlib import Path
 from torchsar.spelling import entries_with
 from torchsar.study.settings.errors import ConfigError
 
-_MOST = 10_000  # threads or processes, far more than machines have
-_LONGEST = 2000  # characters of a message, far more than those without a long path or value
-EXIT_BAD_INPUT = 2  # the status of argparse for a command line that it rejects
+_MOST = 10_000  # limit for numbers of threads and processes, far above those of any machine
+_LONGEST = 2000  # largest number of characters of a message; only a long path or value exceeds it
+EXIT_BAD_INPUT = 2  # exit status that argparse uses for a rejected command line
 _COMMANDS = {
     "run": "run an experiment and write its images, figures and report",
     "focus": "focus a recorded strip that is longer than memory, block by block",
@@ -35,7 +35,7 @@ _EXCHANGE = {
 _REPRODUCE = "make the figures, tables and numbers of the papers, and compare them with what was published"
 
 
-# commands that only print, and need no device
+# commands that only print and do not compute on a device
 _PRINTED = {
     "list": "experiments, systems, stages and data keys",
     "config": "print a packaged config, to begin one's own with, or the JSON schema of configs for editors",
@@ -113,14 +113,14 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _configs(**_: object) -> list[str]:
-    """Names of packaged configs, which `argcomplete` offers where a config is expected."""
+    """Names of the packaged configs, which `argcomplete` suggests as arguments."""
     from torchsar.study.settings.text import packaged_configs
 
     return [*packaged_configs()]
 
 
 def _folder(command: str, config: str) -> Path:
-    """The default result folder, which is different for each command."""
+    """Default result folder of a command for a config."""
     return Path("out") / (config if command == "run" else f"{config}_{command}")
 
 
@@ -133,7 +133,7 @@ def _positive(text: str) -> int:
 
 
 def _place(text: str) -> Path:
-    if not text:  # such as a variable of the shell that is not set
+    if not text:  # empty, for instance from a shell variable that is not set
         raise argparse.ArgumentTypeError("the name of the folder is empty; '.' is the working folder")
     return Path(text)
 
@@ -148,7 +148,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Exit status: 0 after success, 1 if stdout was closed, 2 if the input is invalid (a message
         on stderr says why), 130 if the user interrupted the command.
     """
-    if "_ARGCOMPLETE" in os.environ:  # a shell asks for the words that may follow, and nothing else is done
+    # the shell asks for completions of a word; the program then ends
+    if "_ARGCOMPLETE" in os.environ:
         import argcomplete
 
         argcomplete.autocomplete(parser())
@@ -157,7 +158,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if wrong is not None:
         return _fail(f"the argument {wrong!r} has characters that are no text; rename the file or folder, or retype it")
     options = _parse(given)
-    # threads that spin while they wait starve those that work; torch reads this when it is imported
+    # OpenMP threads that wait actively slow down the working ones; torch reads the variable when it
+    # is imported
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         if options.version:
@@ -167,7 +169,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 0
         if options.command == "reproduce":
             print(f"torchsar: reproduce {options.paper or 'all papers'}", file=sys.stderr, flush=True)
-        elif options.command not in _PRINTED:  # before the import of torch, which takes seconds
+        # checked before the import of torch, which takes seconds
+        elif options.command not in _PRINTED:
             subject = options.file if options.command in _EXCHANGE else options.config
             print(f"torchsar: {options.command} {subject}", file=sys.stderr, flush=True)
         with _log_to_stderr(), warnings.catch_warnings(), _short_memory(), _interrupts_kept():
@@ -176,16 +179,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
             sys.stdout.flush()
             return status
     except ImportError as error:
-        if (error.name or "").startswith("torchsar"):  # a fault of the program, not of the installation
+        # an error of the program, not of the installation
+        if (error.name or "").startswith("torchsar"):
             raise
-        if "torchsar-lab[" in str(error):  # names the extra
+        if "torchsar-lab[" in str(error):  # the message names the missing extra
             return _fail(str(error))
         return _fail(f"{error.name or error} is not installed; install the extra: pip install 'torchsar-lab[study]'")
     except ConfigError as error:
         return _fail(str(error))
     except MemoryError as error:
         return _fail(f"{error}; make the scene smaller, or take a larger machine")
-    except BrokenPipeError:  # the reader of stdout, such as `head`, has ended
+    except BrokenPipeError:  # the program that reads stdout, such as `head`, has ended
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:
@@ -196,7 +200,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _is_text(word: str) -> bool:
-    """Whether a word can be printed and name a file: no NUL, and no byte that is not UTF-8."""
+    """True if a word can be printed and can be a file name: valid UTF-8 without NUL."""
     try:
         return "\0" not in word and bool(word.encode() or True)
     except UnicodeEncodeError:
@@ -204,7 +208,7 @@ def _is_text(word: str) -> bool:
 
 
 def _parse(given: Sequence[str]) -> argparse.Namespace:
-    """Parse the arguments; overrides may precede and follow options."""
+    """Parse the command line; overrides may be written before and after options."""
     top = parser()
     options, rest = top.parse_known_args(given)
     if rest and (not hasattr(options, "overrides") or any(word.startswith("-") for word in rest)):
@@ -229,14 +233,15 @@ def _dispatch(options: argparse.Namespace, command: str) -> int:
             raise ConfigError(str(error)) from error
     if options.command in _PRINTED:
         return _print(options)
-    find_config(options.config)  # an unknown name, before the import of torch
+    find_config(options.config)  # detects an unknown name before the import of torch
     import torch
 
     from torchsar.core import device_fault
     from torchsar.study.memory import keep_freed_memory
     from torchsar.study.table import load
 
-    if options.command != "focus":  # whose blocks are so large that kept ones would not fit
+    # not for `focus`, whose blocks are too large for memory that is kept for reuse
+    if options.command != "focus":
         keep_freed_memory()
     if options.threads is not None:
         torch.set_num_threads(options.threads)
@@ -288,7 +293,7 @@ def _print(options: argparse.Namespace) -> int:
         return 0
     if options.command == "list":
         names = entries_with(options.words, experiments())
-        print(names, end="\n" if names else "", flush=True)  # before the import of torch
+        print(names, end="\n" if names else "", flush=True)  # printed before the import of torch
     from torchsar.study.table import systems
 
     if options.command == "list":
@@ -308,7 +313,7 @@ def _print(options: argparse.Namespace) -> int:
 def _import(options: argparse.Namespace) -> int:
     from torchsar.study.settings.text import read_tree
 
-    sidecar = read_tree(Path(options.sidecar))  # before the import of torch
+    sidecar = read_tree(Path(options.sidecar))  # read before the import of torch
     from torchsar.io import import_recording
 
     print(import_recording(options.file, sidecar, options.out, options.sidecar))
@@ -358,7 +363,7 @@ def _fail(sentence: str) -> int:
 
 @contextmanager
 def _short_memory() -> Iterator[None]:
-    """Turn the errors by which torch says that memory is short into a MemoryError."""
+    """Raise a MemoryError instead of the errors that torch raises if memory is insufficient."""
     try:
         yield
     except (RuntimeError, MemoryError) as error:
@@ -373,8 +378,9 @@ def _short_memory() -> Iterator[None]:
 
 @contextmanager
 def _interrupts_kept() -> Iterator[None]:
-    """Interrupt again where Python drops Ctrl-C, as it does with any exception in a callback of the
-    garbage collector or of an import.
+    """Repeat an interrupt (Ctrl-C) that Python has ignored.
+
+    Python ignores every exception in a callback of the garbage collector or of an import.
     """
     earlier, again = sys.unraisablehook, list[threading.Timer]()
 

@@ -38,8 +38,9 @@ class Simulated(IterableDataset[Pair]):
 
     Args:
         source: Name of a packaged config or path of a YAML file, which is simulated as by
-            `torchsar run`; or a function that is given Draws and returns a recording and its truth,
-            such as one that calls `torchsar.echo.simulate`. A config needs the extra `study`.
+            `torchsar run`. It may also be a function that is given Draws and returns a recording
+            and its truth, such as one that calls `torchsar.echo.simulate`. A config needs the extra
+            `study`.
         draws: Seed, case, source and numbers of the trials; `seed` and `random` of a config are not
             used.
         batch: Number of trials in a batch; the last one may be smaller.
@@ -54,10 +55,10 @@ class Simulated(IterableDataset[Pair]):
     Raises:
         TypeError: If `draws` are not Draws, the source is no config and no function, or a function
             does not return a Recording and a Truth.
-        ValueError: If there are no numbers of trials, the batch has less than one trial, the device
-            cannot be used, the config or an override is invalid, the config processes a recording,
-            the case does not exist, a number that `vary` gives cannot differ between trials, or
-            arguments for a config are combined with a function.
+        ValueError: If there are no numbers of trials, the batch has less than one trial, or the
+            device cannot be used. For a config: if it or an override is invalid, it processes a
+            recording, the case does not exist, or a number of `vary` cannot differ between trials.
+            For a function: if it is combined with arguments for a config.
         ImportError: If a package of the extra `study`, which a config needs, is not installed.
     """
 
@@ -111,7 +112,7 @@ class Simulated(IterableDataset[Pair]):
             yield pair
 
     def _part(self, index: int) -> Draws:
-        """Draws of one batch."""
+        """Draws of one batch of trials."""
         part, case = slice(index * self.batch, (index + 1) * self.batch), self.draws.case
         return replace(self.draws, trials=self.trials[part], case=case[part] if isinstance(case, tuple) else case)
 
@@ -159,7 +160,9 @@ def config_chain(
 
 
 def _refuse_fixed(bench: Any, key: str) -> str:
-    """The key below `world`; ValueError if it cannot differ between trials."""
+    """Return the part of a key after "world."; raise ValueError if it must be equal in
+    all trials.
+    """
     section, _, rest = key.partition(".")
     if section != "world" or not bench.system.may_differ(rest, bench.config.world):
         raise ValueError(f"{bench.file}: vary gives {key!r}, which cannot differ between trials of a batch")
@@ -168,7 +171,7 @@ def _refuse_fixed(bench: Any, key: str) -> str:
 
 @dataclass(frozen=True)
 class _Function:
-    """A function that simulates, with a check of its result."""
+    """A user's simulation function, with a check of its result."""
 
     function: Callable[[Draws], Pair]
     device: str
@@ -185,7 +188,7 @@ class _Function:
 
 @dataclass(frozen=True)
 class _Config:
-    """The simulation of a config. Other processes get its name and build their own bench."""
+    """The simulation of a config. In another process the config is loaded again by its name."""
 
     source: str
     overrides: tuple[str, ...]
@@ -202,7 +205,7 @@ class _Config:
 
     @cached_property
     def bench(self) -> Any:
-        """Radar and world."""
+        """Radar and world of the config."""
         try:
             from torchsar.study.settings.sections import cases_of
             from torchsar.study.table import load
@@ -224,7 +227,9 @@ class _Config:
         return Bench(cases[name], self.device)
 
     def given(self, draws: Draws) -> dict[str, Tensor]:
-        """Numbers of the world that differ between trials, by dotted key below `world`."""
+        """Numbers of the world that differ between trials, by the part of the dotted key after
+        "world.".
+        """
         bench, count, found = self.bench, len(draws.trials or ()), {}
         for key, value in ({} if self.vary is None else self.vary(draws)).items():
             rest = _refuse_fixed(bench, key)

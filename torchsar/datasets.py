@@ -7,7 +7,8 @@ import torch
 from torchsar.core import Draws, Recording, Truth
 from torchsar.data import Simulated
 
-# for each system a packaged config, its case, and what makes it small or leaves errors to find
+# Packaged config, case and overrides of the example of each system.
+# The overrides reduce the size of the scene, or add noise so that errors remain to be found.
 _EXAMPLES: dict[str, tuple[str, str | None, tuple[str, ...]]] = {
     "stripmap": (
         "stripmap_damaged",

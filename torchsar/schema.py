@@ -18,14 +18,14 @@ from torchsar.study.settings.signature import AUTO, Catalogue, Key, Section
 from torchsar.study.trials.system import System
 
 Schema = dict[str, Any]
-# editors know this draft best
+# editors support this draft best
 _DRAFT = "http://json-schema.org/draft-07/schema#"
-# keys of the config that may be axes of the grid of a sweep
+# keys of a config that may be axes of the parameter grid of a sweep
 _AXES = r"\.|^(seed|random|precision)$"
 _AUTO: Schema = {"const": AUTO}
 _NULL: Schema = {"type": "null"}
 _NOTHING: Mapping[str, Schema] = {}
-# keys of a stage that connect it in a chain
+# keys that connect a stage to earlier stages of its chain
 _CONNECTIONS: Schema = {
     "uses": {"type": "object", "additionalProperties": {"type": "string"}},
     "in_doubt": {"enum": ["neutral", "apply"]},
@@ -76,8 +76,9 @@ class _Definitions:
         self.found = found
 
     def add(self, name: str, schema: Schema) -> Schema:
-        """Add a definition, under another name if there is a different one of this name, and return
-        the reference to it.
+        """Add a definition and return the reference to it.
+
+        If there is a different definition of the same name, a number is appended to the name.
         """
         same = (f"{name}{'' if i == 1 else f' {i}'}" for i in range(1, len(self.found) + 2))
         free = next(one for one in same if self.found.get(one, schema) == schema)
@@ -85,11 +86,14 @@ class _Definitions:
         return {"$ref": f"#/definitions/{free.replace(' ', '%20')}"}
 
     def section(self, section: Section, name: str = "") -> Schema:
-        """A section as a definition."""
+        """Add a section as a definition and return the reference to it."""
         return self.add(name or section.target.__name__, self.keys(section))
 
     def keys(self, section: Section, fixed: Mapping[str, Schema] = _NOTHING) -> Schema:
-        """The keys of a section, with further ones that are required and some that are optional."""
+        """Schema of the keys of a section.
+
+        fixed: schemas of further keys, which are the same in every section.
+        """
         about, found, required = arguments(section.target), dict(fixed), []
         for name, key in section.keys.items():
             schema = self.key(key)
@@ -100,7 +104,7 @@ class _Definitions:
         return {"type": "object", "properties": found, "required": required, "additionalProperties": False}
 
     def key(self, key: Key) -> Schema:
-        """The values of a key."""
+        """Schema of the values of a key."""
         if key.inner is None:
             return TypeAdapter(key.type).json_schema()
         one = self.section(key.inner) if isinstance(key.inner, Section) else self.catalogue(key.inner)
@@ -108,7 +112,10 @@ class _Definitions:
         return {"anyOf": [schema, _NULL]} if type(None) in get_args(key.type) or key.default is None else schema
 
     def catalogue(self, catalogue: Catalogue, further: Mapping[str, Schema] = _NOTHING, name: str = "") -> Schema:
-        """The entries of a catalogue; one without keys of its own may stand as its name alone."""
+        """Add the schema of the entries of a catalogue and return the reference to it.
+
+        An entry without keys may be written as its name instead of a mapping.
+        """
         entries: list[Schema] = [{"enum": list(catalogue.entries)}] if not further else []
         if any(section.automatic for section in catalogue.sections.values()) or not further:
             entries.append({"type": "object", "properties": {catalogue.key: _AUTO}, "required": [catalogue.key]})
@@ -120,7 +127,9 @@ class _Definitions:
 
 
 def _of_system(name: str, system: System, known: _Definitions, named: bool) -> Schema:
-    """What the sections and stages of a config may hold if it names a system, or none."""
+    """Schema of the sections and stages that a config may have if it names this system or no
+    system.
+    """
     sections = {section: known.section(keys, f"{name} {section}") for section, keys in system.sections.items()}
     for section in ("radar", "world"):
         sections[section] = {"anyOf": [sections[section], _NULL]}

@@ -19,8 +19,11 @@ def entries_with(words: Iterable[str], text: str) -> str:
         itself without words.
     """
     wanted, found = [word.lower() for word in words], []
-    above: list[tuple[int, str]] = []  # indent and text of the lines to which the next one may belong
-    shown = taken = -1  # indent of the last of them in `found`, and of the entry whose lines are taken
+    # indent and text of the lines to which the next line may belong
+    above: list[tuple[int, str]] = []
+    # shown: indent of the last line in `found`
+    # taken: indent of the entry whose lines are selected; -1 if there is none
+    shown = taken = -1
     for line in text.splitlines():
         depth = len(line) - len(line.lstrip())
         above = [(deep, one) for deep, one in above if deep < depth and line]

@@ -24,7 +24,7 @@ from torchsar.study.settings.sections import Loaded
 from torchsar.study.trials.bench import build_chains
 
 log = logging.getLogger("torchsar")
-# image lines of a chunk of the store at most
+# largest number of image lines in a chunk of the store
 _CHUNK_LINES = 256
 FILES = ("config.yaml", "quick_look.png")
 _HINT = "a chain for long strips has estimators, one stage focus_strip, then detect and quick_look, or neither"
@@ -89,7 +89,7 @@ def export_strip(path: Path, form: str, out: Path) -> None:
 
 
 class _Strip:
-    """A recording, and the stages of a config that make an image of it."""
+    """A strip recording and the stages of a config that make an image of it."""
 
     def __init__(self, loaded: Loaded, device: str) -> None:
         config, self._device = loaded.config, device
@@ -120,7 +120,7 @@ class _Strip:
         self._identity = {"recording": [shape, radar], "config": [recommended, config.precision]}
 
     def focused(self, folder: ResultFolder, resume: bool) -> StripImage:
-        """The image in the folder: blocks that it has are checked, the others computed."""
+        """Compute the image in the folder; finished blocks are only checked."""
         path = folder.path / "image.zarr"
         if path.exists() and not folder.claimed:
             raise ConfigError(f"--out {folder.path}: torchsar focus did not write {path.name}; choose another folder")
@@ -147,9 +147,9 @@ class _Strip:
                     image.check(self._rows(image, keep), checksum)
                     continue
                 if image is not None and keep.stop - keep.start < self._looks:
-                    break  # the last lines do not fill a look
+                    break  # too few lines are left for a look
                 block = self._block(raw, read, keep, values)
-                if image is None:  # the first block tells the size of the image
+                if image is None:  # the size of the image is known after the first block
                     about = {"values": known, "rows": [block.axes[0].n, keep.stop]}
                     axes, dtype = self._axes(block, plan, keep), block.data.dtype
                     image = StripImage.create(path, axes, dtype, identity, about, self._chunk_lines)
@@ -160,31 +160,37 @@ class _Strip:
 
     @staticmethod
     def _axes(first: Signal, plan: StripPlan, keep: slice) -> tuple[Axis, Axis]:
-        """Axes of the whole image, whose first block has the rows of the lines that it keeps."""
+        """Axes of the whole image, computed from the first block and the raw lines that it
+        represents.
+        """
         azimuth, range_ = first.axes
         return azimuth.part(0, plan.n_lines * azimuth.n // keep.stop), range_
 
     @staticmethod
     def _rows(image: StripImage, keep: slice) -> slice:
-        """Rows of an image that belong to raw lines; there may be several per line, or looks."""
+        """Rows of the image that belong to raw lines; the numbers of rows and lines may differ."""
         rows, lines = image.about["rows"]
         return slice(keep.start * rows // lines, keep.stop * rows // lines)
 
     @torch.no_grad()
     def _block(self, raw: Tensor, read: slice, keep: slice, values: Mapping[str, Tensor]) -> Signal:
-        """The image of a block, detected if the chain says so."""
+        """Focus a block of raw lines, and detect it if the chain has a stage for this."""
         given = {name: value.to(self._device) for name, value in values.items()}
         focus, radar = self.focus.focuser, self.recording.radar
         image = focus_block(raw.to(self._device), focus, radar, self.recording.axes, read, keep, given)
         return image if self.detect is None else self.detect(image)
 
     def _plan(self, values: Mapping[str, Tensor]) -> StripPlan:
-        """Blocks whose image lines are whole chunks of the store and whole looks."""
+        """Plan the blocks so that their image lines are whole chunks of the store and
+        whole looks.
+        """
         strip, multiple = self.recording, self._chunk_lines * self._looks
         return self.focus.plan(strip.shape, strip.axes, strip.dtype.itemsize, multiple, **values)
 
     def _estimated(self) -> dict[str, float]:
-        """Values that the estimators before the focusing stage find in the middle of the strip."""
+        """Values of the estimators before the focusing stage, from lines in the middle of the
+        strip.
+        """
         if not self._before:
             return {}
         n, samples = self.recording.shape

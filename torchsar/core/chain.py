@@ -289,8 +289,8 @@ class Chain(Shown, nn.Module):
                 values; "given.NAME" sets a value that a stage takes from the caller. A stage for
                 which `given` holds every value that it provides does not run at all, even if it
                 would change the signal. "STAGE" with an Estimate, such as that of an earlier trace,
-                has the same effect; its values count except where they failed, and there the
-                neutral values of the estimate, or of the stage if it has none, are used.
+                has the same effect. Where this estimate failed, its neutral values are used, or
+                those of the stage if it has none.
             draws: Random draws of the stages that simulate or impair a recording. A simulation uses
                 them as they are, an impairment the part with the name of its stage.
 

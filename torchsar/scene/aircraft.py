@@ -16,8 +16,9 @@ from torchsar.core import Draws
 from torchsar.scene.targets import Scatterers, Scene, turned, unit_phases
 from torchsar.scene.trials import finite_numbers, refuse_unless, with_dims
 
-# one half of the outline from nose to tail, and the fin from above, along the fuselage in lengths
-# and across it in half spans; chosen here, as the publication gives no coordinates
+# Half of the outline from nose to tail, and the fin from above.
+# Each point is the position along the fuselage in lengths of the aircraft and across it in half
+# wing spans. The shape is chosen here, because the publication gives no coordinates.
 _SIDE = (
     (0.50, 0.000),
     (0.47, 0.060),

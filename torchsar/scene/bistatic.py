@@ -190,7 +190,7 @@ class TaylorRange(ReceiveRange):
         closest = movers.closest_m(radar)[..., None, None, :]
         excess = movers.excess_m(time_s, radar) / closest
         x = excess * (excess + 2)
-        # coefficients of x, x^2, ... in sqrt(1 + x)
+        # coefficients of x, x^2, ... in the power series of sqrt(1 + x)
         factors = [1.0]
         for n in range(self.order // 2):
             factors.append(factors[-1] * ((0.5 - n) / (n + 1)))

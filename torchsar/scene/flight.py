@@ -24,7 +24,7 @@ from torchsar.scene.fluctuation import MeasuredTrack, RandomMotion, drawn_motion
 from torchsar.scene.trials import finite_numbers, refuse_other_trials, refuse_unless
 from torchsar.scene.vibration import Motion, displacement_m
 
-# longest latency and interval of records of a navigation in s, by choice
+# largest latency and largest interval of navigation records in seconds, by choice
 _LONGEST_S = 0.5
 
 
@@ -134,7 +134,7 @@ class RecordedPath(NominalPath):
             `resample_path`.
     """
 
-    track: Any  # a Track, which all trials share
+    track: Any  # a Track, the same for all trials
     start_s: float | None = None
 
     def __post_init__(self) -> None:
@@ -415,19 +415,20 @@ class Navigation:
         return resample_path(at, self._records_m(error, at, path), time_s, jump_m=math.inf)
 
     def _records_m(self, error: Sway, time_s: Tensor, path: NominalPath) -> Tensor:
-        """Records at times (record,), shape (*trials, record, 3)."""
+        """Navigation records at times (record,): positions (*trials, record, 3)."""
         recorded = self._late_m(time_s, path) + error.displacement_m(time_s)
         quantum = per_trial(self.step_m, 2, time_s)
         whole = torch.round(recorded / torch.where(quantum > 0, quantum, 1)) * quantum
         return torch.where(quantum > 0, whole, recorded)
 
     def _late_m(self, time_s: Tensor, path: NominalPath) -> Tensor:
-        """True positions at the times less the latency, shape (*trials, record, 3)."""
+        """True positions at the given times minus the latency, (*trials, record, 3)."""
         latency = torch.as_tensor(self.latency_s, dtype=torch.float64, device=time_s.device)
         if not latency.ndim:
             return path.position_m(time_s - latency)
-        # motions take times that all trials share: interpolate between such times, which are those
-        # of jitter from pulse to pulse, and do not depend on the latencies of other trials
+        # Motions are evaluated at times that are the same for all trials, and interpolated at the
+        # delayed times. The interval is that of jitter from pulse to pulse. A trial therefore does
+        # not depend on the latencies of other trials.
         step_s = float(time_s.diff().min())
         before, after = (math.ceil(s / step_s) for s in (_LONGEST_S, float(time_s[-1] - time_s[0]) + _LONGEST_S))
         at = time_s[0] + step_s * torch.arange(-before, after + 1, dtype=torch.float64, device=time_s.device)
@@ -436,8 +437,10 @@ class Navigation:
 
 
 def _steps(span_s: float, step_s: float) -> Tensor:
-    """Times in equal steps from a second before the first pulse to one after the last, zero among
-    them: what navigation records late, and between pulses, lies within.
+    """Times in equal steps from one second before the first pulse to one second after the last.
+
+    Zero is one of the times. The interval contains all records, including those with latency and
+    those between pulses.
     """
     before, after = (math.ceil(time_s / step_s - 1e-9) for time_s in (1.0, span_s + 1.0))
     return step_s * torch.arange(-before, after + 1, dtype=torch.float64)

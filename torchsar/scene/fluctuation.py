@@ -66,7 +66,7 @@ class Tones(Motion):
     sine: Tensor
 
     def value(self, time_s: Tensor) -> Tensor:
-        """Evaluate the sum in blocks of times, so that memory stays bounded.
+        """Evaluate the sum in blocks of times, which limits the memory.
 
         Args:
             time_s: Times in seconds, any shape, shared by all trials, float64.
@@ -74,7 +74,7 @@ class Tones(Motion):
         Returns:
             Sum in the unit of the amplitudes, shape (*trials, *times), float64.
         """
-        # the phases of 64 tones then take 8 MB, about the cache of a processor
+        # the phases of 64 sinusoids then take 8 MB, about the size of a processor's cache
         times = max(1, (1 << 14) // self.frequency_hz.shape[:-1].numel())
         parts = [self._block(block) for block in time_s.flatten().split(times)]
         values = torch.cat(parts, -1)
@@ -83,18 +83,20 @@ class Tones(Motion):
     displacement_m = value
 
     def _block(self, time_s: Tensor) -> Tensor:
-        """The sum at times (time,), (*trials, time)."""
+        """Sum of the sinusoids at times (time,), (*trials, time)."""
         turns = self.frequency_hz.to(time_s.device)[..., None] * time_s
         angle = 2 * math.pi * (turns - torch.round(turns.detach()))
         cosine, sine = self.cosine.to(time_s.device), self.sine.to(time_s.device)
-        if angle.ndim == 2:  # frequencies that all trials share
+        if angle.ndim == 2:  # the frequencies are the same in all trials
             return cosine @ torch.cos(angle) + sine @ torch.sin(angle)
         return (cosine[..., None, :] @ torch.cos(angle) + sine[..., None, :] @ torch.sin(angle))[..., 0, :]
 
 
 @dataclass(frozen=True)
 class _PowerLaw:
-    """Base of random functions of time whose spectral density follows a power of the frequency."""
+    """Base of random functions of time whose power spectral density follows a power of the
+    frequency.
+    """
 
     def __post_init__(self) -> None:
         expected = "a random motion needs 0 < lowest_hz <= highest_hz and a finite slope"
@@ -110,12 +112,14 @@ class _PowerLaw:
 
     @property
     def _band(self) -> tuple[Tensor | float | None, Tensor | float | None, Tensor | float, int]:
-        """Limits of the band, exponent, and number of sinusoids."""
+        """Lower and upper limit of the band in Hz, exponent of the density, and number of
+        sinusoids.
+        """
         return tuple(getattr(self, name) for name in ("lowest_hz", "highest_hz", "slope", "count"))  # pyright: ignore
 
     @property
     def _rms(self) -> Tensor | float:
-        """Root mean square, the first parameter of the class."""
+        """Root mean square value, which is the first parameter of the class."""
         return getattr(self, fields(self)[0].name)
 
     def drawn(self, draws: Draws, span_s: float) -> Tones:
@@ -269,7 +273,8 @@ def random_tones(
     lowest_hz, highest_hz, slope = (with_dims(v, 1, angle) for v in (lowest_hz, highest_hz, slope))
     edges = lowest_hz * (highest_hz / lowest_hz) ** (torch.arange(count + 1, dtype=torch.float64) / count)
     middle = torch.sqrt(edges[..., :-1] * edges[..., 1:])
-    # power of a part of the band: density times width, which is proportional to the frequency
+    # power of an interval of the band: density times width, and the width is proportional to the
+    # frequency
     power = (middle / lowest_hz) ** (slope + 1)
     amplitude = torch.sqrt(2 * power / power.sum(-1, keepdim=True))
     level = torch.as_tensor(rms, dtype=torch.float64)[..., None] * amplitude

@@ -66,12 +66,12 @@ class Extremes:
             The extremes.
         """
         span_s = n_period * radar.pulse_step_s
-        # 16 times a period, 4 million at most
+        # 16 samples per period, but at most 4 million
         n = min(max(8, n_period * radar.keep_every * 16), 1 << 22)
         time_s = torch.arange(n, dtype=torch.float64) * (span_s / n)
         course = displacement_m(motion, time_s).reshape(-1, n)[0]
         velocity = torch.gradient(course, spacing=span_s / n)[0]
-        # differences of differences are less accurate at the ends
+        # repeated numerical differentiation is less accurate at the ends, which are left out
         acceleration = torch.gradient(velocity, spacing=span_s / n)[0][2:-2]
         jerk = torch.gradient(acceleration, spacing=span_s / n)[0][2:-2]
         return Extremes(
@@ -163,13 +163,13 @@ class RangeHistory:
         c = self.radar.wave_speed_m_s
         then = time_s - self.radar.reference_range_m / c
         there = self._reflected(then)
-        # the step of the difference is short against any motion, while rounding of a range of 1 m
-        # costs 2e-10 m/s
+        # The step of the numerical derivative is short compared with any motion. Rounding of a
+        # range of 1 m causes an error of 2e-10 m/s.
         short_s = 1e-6
         return there - (there - self._reflected(then - short_s)) / short_s * there / c
 
     def _reflected(self, time_s: Tensor) -> Tensor:
-        """Relative range at the times of reflection, (*trials, *times, target)."""
+        """Relative range at given times of reflection, (*trials, *times, target)."""
         x, near = self.scatterers.azimuth_m, self.radar.reference_range_m + self.scatterers.range_m
         x, near, relative = (
             v[(...,) + (None,) * time_s.ndim + (slice(None),)] for v in (x, near, self.scatterers.range_m)
@@ -240,7 +240,9 @@ class Fidelity:
         return {**self._level_rad(radar, extremes), **omitted_phase_rad(self.without, radar, extremes)}
 
     def _level_rad(self, radar: TriangularLadar, extremes: Extremes) -> dict[str, float]:
-        """Largest phase due to the approximation of the range within a sweep, as `level`."""
+        """Largest phase errors due to the approximation of the range within a sweep, with the key
+        "level".
+        """
         return {}
 
 
@@ -289,8 +291,9 @@ class QuadraticInSweep(Fidelity):
         return history.chords(middle_s, history.radar.sweep_s / 2)
 
     def _level_rad(self, radar: TriangularLadar, extremes: Extremes) -> dict[str, float]:
-        # radial jerk j, and radial acceleration over the band. At the time u from the middle of a
-        # sweep of the length T the jerk causes the range error j u (u^2 - (T/2)^2) / 6
+        # The phases are due to the radial jerk j and to the radial acceleration over the band.
+        # At the time u from the middle of a sweep of length T, the jerk causes the range error j u
+        # (u^2 - (T/2)^2) / 6.
         t = radar.sweep_s
         jerk = 4 * math.pi / radar.wavelength_m * extremes.jerk_m_s3 * (t / 2) ** 3 / 6 * 2 / math.sqrt(27)
         band = 2 * math.pi * radar.chirp_rate_hz_s * extremes.acceleration_m_s2 / radar.wave_speed_m_s * (t / 2) ** 3
@@ -319,8 +322,8 @@ class LinearInSweep(Fidelity):
     """
 
     def _level_rad(self, radar: TriangularLadar, extremes: Extremes) -> dict[str, float]:
-        # phase at the ends of a sweep due to the radial acceleration a and the radial velocity v:
-        # 4 pi / lambda a T^2 / 8 + pi K v T^2 / c, with the length T and the rate K of the sweep
+        # The phase at the ends of a sweep of length T and chirp rate K is 4 pi / lambda a T^2 / 8 +
+        # pi K v T^2 / c. It is due to the radial acceleration a and the radial velocity v.
         t = radar.sweep_s
         bend = 4 * math.pi / radar.wavelength_m * extremes.acceleration_m_s2 * t**2 / 8
         band = math.pi * radar.chirp_rate_hz_s * extremes.velocity_m_s * t**2 / radar.wave_speed_m_s
@@ -353,7 +356,7 @@ class OnePerSweep(Fidelity):
         return middle, torch.zeros_like(middle), None
 
     def _level_rad(self, radar: TriangularLadar, extremes: Extremes) -> dict[str, float]:
-        # phase due to the velocity at the ends of a sweep, at the upper edge of the band
+        # phase at the ends of a sweep due to the radial velocity, at the upper edge of the band
         upper = radar.carrier_hz + radar.bandwidth_hz / 2
         return {"level": 4 * math.pi * upper / radar.wave_speed_m_s * extremes.velocity_m_s * radar.sweep_s / 2}
 
@@ -382,5 +385,5 @@ class OnePerPeriod(OnePerSweep):
         return super().sweep_range_m(history, middle_s.mean(0, keepdim=True).expand_as(middle_s))
 
     def _level_rad(self, radar: TriangularLadar, extremes: Extremes) -> dict[str, float]:
-        # a period is twice as long as a sweep
+        # a period has twice the length of a sweep
         return {"level": 2 * super()._level_rad(radar, extremes)["level"]}

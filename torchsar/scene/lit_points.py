@@ -54,7 +54,7 @@ class LitPoints:
         return power * ((self.time_s - self.movers.y0_m / along).abs() <= half_s)
 
     def _worst_db(self, phase_rad: Tensor) -> float:
-        """Error of the worst point for phases (row or 1, time, any)."""
+        """Error in dB of the point with the largest error, for phases (row or 1, time, any)."""
         square = (2 - 2 * torch.cos(phase_rad)).mean(-1)
         error = (self.weight * square).sum(-1) / self.weight.sum(-1).clamp_min(torch.finfo(torch.float64).tiny)
         return 10 * math.log10(max(float(error.max()), 1e-30))

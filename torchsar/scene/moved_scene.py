@@ -36,7 +36,7 @@ class Moved:
 
     @property
     def farthest(self) -> Points:
-        """The scatterer farthest from the middle of the scene among the strongest ones."""
+        """Of the strongest scatterers, the one farthest from the middle of the scene."""
         far = int((self.range_m.abs() + self.azimuth_m.abs()).argmax())
         return Points([float(self.azimuth_m[far])], [float(self.range_m[far])])
 
@@ -82,7 +82,10 @@ class Moved:
 
 
 def _refuse_unseen_ranges(radar: TriangularLadar, near_m: float, far_m: float) -> None:
-    """Raise ValueError for relative ranges of scatterers in metres that no sweep can show."""
+    """Raise ValueError if the relative ranges of scatterers in metres cannot be observed.
+
+    A scatterer must be in front of the ladar, and its beat frequency must not be aliased.
+    """
     if near_m <= -radar.reference_range_m:
         raise ValueError(
             f"world: a scatterer at the relative range {near_m:g} m lies behind the ladar, whose reference range is "

@@ -57,7 +57,7 @@ class Bend:
 
     @property
     def tensors(self) -> tuple[Tensor, ...]:
-        """The coefficients in the order of the parameters."""
+        """The coefficients in the order of the constructor's parameters."""
         return tuple(vars(self).values())
 
     def square_m2(self, time_s: Tensor) -> Tensor:
@@ -128,7 +128,7 @@ class Movers:
 
     @property
     def tensors(self) -> tuple[Tensor, ...]:
-        """Speeds, position, range and amplitude."""
+        """Speeds, position, range and amplitude of the targets."""
         return self.u_r_m_s, self.u_a_m_s, self.y0_m, self.range_m, self.amplitude
 
     def each(self, change: Callable[[Tensor], Tensor]) -> Movers:
@@ -219,7 +219,7 @@ class MovingScene(Protocol):
 
 
 def _numbers(values: Numbers) -> Tensor:
-    """float64 tensor of real numbers, complex128 of complex ones, (..., target)."""
+    """Convert real numbers to a float64 tensor and complex ones to complex128, (..., target)."""
     if isinstance(values, (int, float, complex)) or (isinstance(values, Tensor) and not values.ndim):
         raise ValueError(
             f"moving points take lists or tensors with one entry per target, got the number {values}; write [{values}]"

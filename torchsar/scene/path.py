@@ -113,7 +113,7 @@ class SideBeam:
         )
         centre = squint + yaw + sway * torch.sin(2 * math.pi * hz * time_s[:, None])
         off = ahead - torch.sin(torch.deg2rad(centre))
-        # sinc^2(0.442946) = 1/2
+        # half power of the pattern: sinc^2(0.442946) = 1/2
         return torch.sinc(0.442946 * off / torch.sin(torch.deg2rad(width) / 2))
 
     def mean_power(self, ahead: Tensor) -> Tensor:
@@ -128,7 +128,8 @@ class SideBeam:
             Gain, shape (..., point), float64.
         """
         time_s = torch.arange(64, dtype=torch.float64) / 64
-        beam = replace(self, sway_hz=torch.as_tensor(self.sway_hz).sign())  # one period in a second, if it sways
+        # the period of a sway is set to one second
+        beam = replace(self, sway_hz=torch.as_tensor(self.sway_hz).sign())
         return beam.gain(time_s, ahead.expand(64, -1)).pow(4).mean(-2)
 
 

@@ -55,7 +55,7 @@ class PolynomialRotation:
             refuse_unless_finite(f"k{order} of a rotation", value)
 
     def _terms(self) -> Sequence[Tensor | float]:
-        """k1, k2, ... one by one."""
+        """Relative derivatives k1, k2, ... of the rotation rate, one by one."""
         return self.k.unbind(-1) if isinstance(self.k, Tensor) else tuple(self.k)
 
     def omega(self, like: Tensor) -> Tensor:
@@ -121,8 +121,8 @@ class PolynomialRotation:
         k = self.warp_k(time_s)
         if not k.shape[-1]:
             return torch.zeros_like(self.rate(time_s))
-        # k1 + k2 t + k3 t^2 / 2 + ... is the rate of a warp with the coefficients k2, k3, ..., with
-        # k1 as its first term instead of 1
+        # k1 + k2 t + k3 t^2 / 2 + ... is computed as the rate of a warp with the coefficients k2,
+        # k3, ... whose first term is k1 instead of 1
         return self.omega(time_s)[..., None] * (k[..., :1] + warp_rate(time_s, k[..., 1:]) - 1)
 
     def mean_rate(self, duration_s: float, like: Tensor) -> Tensor:

@@ -15,44 +15,48 @@ from torchsar.core import Draws
 from torchsar.scene.targets import Scatterers, Scene
 from torchsar.scene.trials import either, finite_numbers, refuse_unless, stacked, with_dims
 
-# Proportions of the body, chosen here; only the panel tip at 6.43 m is published. The axes before
-# the tilt are: along the panels, along the line of sight away from the radar, and across both. The
-# whole is scaled to the given extents.
-_BUS = (0.7, 1.3, 1.2)  # half sides
-_PANEL = (0.8, 6.43, 1.9)  # first and last position along the panels, half chord
-# position along the panels, then on the line of sight the vertex and the feed, radius of the rim,
-# depth
+# The proportions of the body are chosen here; only the position of the panel tip at 6.43 m is
+# published. The three axes before the tilt are: along the panels, along the line of sight away from
+# the radar, and perpendicular to both. The whole model is scaled to the given extents.
+_BUS = (0.7, 1.3, 1.2)  # half lengths of the sides
+_PANEL = (0.8, 6.43, 1.9)  # inner and outer end along the panels, and half width of a panel
+# position along the panels, position of vertex and of feed along the line of sight, radius of the
+# rim, and depth
 _DISH = (0.2, -1.5, -3.1, 1.2, 0.8)
-_BOOM = ((-0.3, 1.3, 0.3), (-0.5, 3.5, 0.3), (0.45, 0.0, 0.0))  # root, tip, half of the crossbar
-# fractions of the scatterers, by choice
+# root, tip, and half of the crossbar
+_BOOM = ((-0.3, 1.3, 0.3), (-0.5, 3.5, 0.3), (0.45, 0.0, 0.0))
+# fraction of the scatterers in each part, by choice
 _SHARES = {"bus": 0.26, "panel_left": 0.29, "panel_right": 0.29, "dish": 0.08, "boom": 0.08}
 
 
 class _Part(Protocol):
-    """Part of the satellite in body coordinates."""
+    """A part of the satellite; its points are in body coordinates."""
 
     def corners(self) -> Tensor:
-        """Corners, equal in all trials, (corner, 3)."""
+        """Positions of the corners, equal in all trials, (corner, 3)."""
         ...
 
     def points(self, u: Tensor) -> Tensor:
-        """Points of uniform random numbers u (..., n, 3), (..., n, 3)."""
+        """Positions of points from uniform random numbers u (..., n, 3), (..., n, 3)."""
         ...
 
 
 def _table(rows: object) -> Tensor:
-    """float64 tensor of nested numbers."""
+    """Make a float64 tensor of nested sequences of numbers."""
     return torch.tensor(rows, dtype=torch.float64)
 
 
 def _spread(u: Tensor) -> Tensor:
-    """One random number in each of n equal cells of 0..1, (..., n): points do not cluster."""
+    """Numbers in 0..1, one at a random position in each of n equal intervals, (..., n).
+
+    Points at such positions do not form clusters.
+    """
     n = u.shape[-1]
     return (torch.arange(n, dtype=u.dtype, device=u.device) + u) / n
 
 
 def _on_lines(starts: Tensor, ends: Tensor, share: Tensor) -> Tensor:
-    """Points at fractions (..., n) of the total length of lines (line, 3), (..., n, 3)."""
+    """Points on lines (line, 3), at given fractions (..., n) of their total length, (..., n, 3)."""
     length = torch.linalg.vector_norm(ends - starts, dim=-1)
     reach = share * length.sum()
     past = length.cumsum(0)
@@ -62,7 +66,7 @@ def _on_lines(starts: Tensor, ends: Tensor, share: Tensor) -> Tensor:
 
 
 class _Bus:
-    """Faces of a box, with points in proportion to their areas."""
+    """Faces of a box; the number of points on a face is proportional to its area."""
 
     def corners(self) -> Tensor:
         return _table(_BUS) * _table(list(itertools.product((-1.0, 1.0), repeat=3)))
@@ -79,12 +83,12 @@ class _Bus:
 
 @dataclass(frozen=True)
 class _Panel:
-    """Lines of a flat grid on one side (-1 or 1) of the bus; its outer edge is the tip."""
+    """Lines of a flat grid on one side (-1 or 1) of the bus."""
 
     side: float
 
     def _at(self, along: Tensor, chord: Tensor) -> Tensor:
-        """Points at fractions along the panel and of the chord."""
+        """Points at fractions of the length of the panel and of its half width."""
         first, last, half = _PANEL
         return torch.stack([self.side * (first + (last - first) * along), torch.zeros_like(along), half * chord], -1)
 
@@ -92,7 +96,7 @@ class _Panel:
         return self._at(_table([0, 0, 1, 1]), _table([-1, 1, -1, 1]))
 
     def points(self, u: Tensor) -> Tensor:
-        # a grid of 4 cells along and 8 across
+        # a grid of 4 cells along the panel and 8 across it
         ribs, strings = (torch.linspace(at, 1, n, dtype=torch.float64) for at, n in ((0, 5), (-1, 9)))
         one_rib, one_string = torch.ones_like(ribs), torch.ones_like(strings)
         starts = torch.cat([self._at(ribs, -one_rib), self._at(0 * one_string, strings)])
@@ -101,7 +105,9 @@ class _Panel:
 
 
 class _Dish:
-    """Paraboloid that opens towards the radar, with the ends of its rim and its feed."""
+    """Paraboloid that opens towards the radar; its corners are the feed and two points of
+    the rim.
+    """
 
     def corners(self) -> Tensor:
         along, vertex, feed, radius, depth = _DISH
@@ -115,7 +121,7 @@ class _Dish:
 
 
 class _Boom:
-    """Rod away from the radar with a crossbar at its end."""
+    """Rod that points away from the radar, with a crossbar at its end."""
 
     def corners(self) -> Tensor:
         return _table([_BOOM[1]])
@@ -125,7 +131,7 @@ class _Boom:
         return _on_lines(torch.stack([root, tip - arm]), torch.stack([tip, tip + arm]), _spread(u[..., 0]))
 
 
-# -1 and 1: signs of cross range on the sides of the two panels
+# -1 and 1 are the signs of the cross range of the two panels
 _PARTS: Mapping[str, _Part] = {
     "bus": _Bus(),
     "panel_left": _Panel(-1.0),
@@ -179,7 +185,7 @@ class Satellite(Scene):
     corner_level: Tensor | float = 1.5
 
     def __post_init__(self) -> None:
-        if self.count < 60:  # each part then has more points than corners
+        if self.count < 60:  # with 60 or more, each part has more points than corners
             raise ValueError(
                 f"a satellite needs at least 60 scatterers to have all of its parts, got count={self.count}"
             )
@@ -212,7 +218,7 @@ class Satellite(Scene):
         return found
 
     def _projected(self, body: Tensor) -> Tensor:
-        """Body points (..., 3) as cross range and range before they are scaled, (..., 2)."""
+        """Project body points (..., 3) to cross range and range before scaling, (..., 2)."""
         cos, sin = (
             with_dims(either(self.tilt_rad, *functions), 1, body)
             for functions in ((math.cos, torch.cos), (math.sin, torch.sin))
@@ -220,7 +226,9 @@ class Satellite(Scene):
         return torch.stack(torch.broadcast_tensors(body[..., 0], cos * body[..., 1] - sin * body[..., 2]), -1)
 
     def _fitted(self, projected: Tensor) -> Tensor:
-        """Positions in metres (..., 2), scaled so that the corners reach the extents."""
+        """Scale projected points to positions in metres (..., 2), so that the corners reach the
+        given extents.
+        """
         corners = self._projected(torch.cat([part.corners() for part in _PARTS.values()]))
         low, high = corners.amin(-2, keepdim=True), corners.amax(-2, keepdim=True)
         half = stacked([self.half_width_m, self.half_depth_m])[..., None, :]
@@ -238,6 +246,6 @@ class Satellite(Scene):
 
 
 def _part_points(part: _Part, u: Tensor) -> Tensor:
-    """Corners of a part, then points for the remaining random numbers, (..., n, 3)."""
+    """Corners of a part, followed by points for the remaining random numbers, (..., n, 3)."""
     corners = part.corners()
     return torch.cat([corners.expand(*u.shape[:-2], -1, -1), part.points(u[..., len(corners) :, :])], -2)

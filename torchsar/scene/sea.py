@@ -15,13 +15,13 @@ from torch import Tensor
 from torchsar.core import Draws, real_dtype, refuse_non_finite
 from torchsar.scene.trials import finite, finite_numbers, refuse_unless, with_dims
 
-# range in standard deviations and number of entries of the table of gamma numbers: linear
-# interpolation between them errs by less than 1e-4
+# _REACH: largest number of standard deviations in the table of gamma numbers
+# _NODES: number of its entries, between which linear interpolation has an error below 1e-4
 _REACH, _NODES = 9.0, 4097
 
 
 def _is_shape(x: Any) -> Any:
-    """Whether a gamma distribution has a shape for which the table was checked, 0.1 to 1000."""
+    """True for shapes of a gamma distribution for which the table was checked, 0.1 to 1000."""
     return (x >= 0.1) & (x <= 1000)
 
 
@@ -111,7 +111,9 @@ class Sea(ABC):
 
 
 def _entries(table: Tensor, index: Tensor, dim: int) -> Tensor:
-    """Entries of a table (..., row, column) along a dimension at indices (n,) or (..., n)."""
+    """Select entries of a table (..., row, column) along a dimension at indices (n,) or
+    (..., n).
+    """
     if index.ndim == 1:
         return table.index_select(dim, index)
     trials = np.broadcast_shapes(table.shape[:-2], index.shape[:-1])
@@ -295,10 +297,11 @@ def gamma_from_normal(x: Tensor, shape: Tensor | float) -> Tensor:
 
 @functools.lru_cache
 def _gamma_table(shape: float) -> Tensor:
-    """Logarithm of the gamma number at equally spaced normal numbers, by bisection."""
+    """Logarithm of the gamma number at equally spaced normal numbers, found by bisection."""
     refuse_unless("shape of a gamma distribution must lie in 0.1..1000", shape, _is_shape)
     x = torch.linspace(-_REACH, _REACH, _NODES, dtype=torch.float64)
-    # the smaller tail probability of each number is matched, which keeps its digits
+    # the smaller of the two tail probabilities of each number is used, since it has a smaller
+    # relative error
     tail, order = torch.special.ndtr(-x.abs()), torch.full_like(x, shape)
     low = torch.full_like(x, -60 / min(shape, 1.0))
     high = torch.full_like(x, math.log(shape + 60 * math.sqrt(shape) + 100))
@@ -313,12 +316,15 @@ def _gamma_table(shape: float) -> Tensor:
 
 
 def _cells(position_m: Tensor, side_m: float) -> Tensor:
-    """Index of the texture cell of each position, from 0; a cell is centred on position zero."""
+    """Index of the texture cell of each position; one cell is centred on position zero."""
     cell = torch.round(position_m / side_m).to(torch.int64)
     return cell - cell.min()
 
 
 def _mirrored(share: Tensor, n: int) -> Tensor:
-    """Pixel of n for positions in units of the extent; image and mirrored image alternate."""
+    """Index of the pixel at positions in units of the image extent.
+
+    The surface beyond the image consists of its mirror images and copies in turn.
+    """
     pixel = torch.remainder(torch.floor((share + 0.5) * n).to(torch.int64), 2 * n)
     return torch.minimum(pixel, 2 * n - 1 - pixel)

@@ -199,8 +199,8 @@ class Dwell(Beam):
     dwell_s: Tensor | float
 
     def weight(self, since_s: Tensor, doppler_offset_hz: Tensor, velocity_m_s: Tensor) -> Tensor:
-        # pulses at the ends of a dwell count as inside: so near, rounding would decide, and
-        # differently on each processor
+        # A tolerance includes the pulses at both ends of a dwell. Otherwise rounding errors would
+        # decide, and the result would depend on the processor.
         half = with_dims(self.dwell_s, 2, since_s) / 2 * (1 + 1e-9)
         return (since_s.abs() <= half).to(since_s.dtype)
 

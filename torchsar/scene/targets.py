@@ -307,7 +307,7 @@ class _Rectangle(Scene):
             refuse_unless_finite(f"{name} of random scatterers", getattr(self, name))
 
     def _places(self, draws: Draws, purpose: str) -> tuple[Tensor, Tensor]:
-        """Random azimuth and range of the scatterers, (..., target) each."""
+        """Draw azimuth and range of the scatterers, (..., target) each."""
         shares = [draws.uniform(f"{purpose}.{name}", (self.count,)) for name in ("azimuth", "range")]
         middles, extents = (self.azimuth_m, self.range_m), (self.azimuth_extent_m, self.range_extent_m)
         x, r = (

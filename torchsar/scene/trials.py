@@ -265,8 +265,9 @@ def repeated(thing: Any, times: int, behind: int = 0) -> Any:
 
 
 def _per_trial_shapes(value: object, name: str = "", behind: int = 0) -> Iterator[tuple[str, torch.Size]]:
-    """Names and trial dimensions of the per-trial parameters of an object and of its parts; the
-    last `behind` dimensions of a tensor are no trials.
+    """Yield names and trial dimensions of the per-trial parameters of an object and of its parts.
+
+    The last `behind` dimensions of a tensor are not trials.
     """
     if isinstance(value, Tensor):
         yield name, value.shape[: max(0, value.ndim - behind)]
@@ -280,8 +281,9 @@ def _per_trial_shapes(value: object, name: str = "", behind: int = 0) -> Iterato
 
 @cache
 def _parameters(kind: type) -> tuple[tuple[str, int], ...]:
-    """Fields of a dataclass, each with the number of trailing dimensions that are no trials."""
-    # a tensor has only trial dims in `Tensor | float`, one more in any other annotation, such as
-    # `Sequence[Tensor | float] | Tensor`; `Any` (an image) is not checked
+    """Fields of a dataclass, each with the number of its last dimensions that are not trials."""
+    # A tensor has only trial dimensions if the annotation is `Tensor | float`. With any other
+    # annotation, such as `Sequence[Tensor | float] | Tensor`, it has one more dimension. `Any` (an
+    # image) is not checked.
     annotations = [(field.name, str(field.type).replace("torch.", "")) for field in fields(kind)]
     return tuple((name, 0 if text.startswith("Tensor | float") else 1) for name, text in annotations if text != "Any")

@@ -257,7 +257,7 @@ class TurntableWorld:
 
 
 def _swing(radar: InverseRadar, n_pulse: int, rotation: float | PolynomialRotation | None) -> tuple[float, float]:
-    """Largest angle from theta = 0 in rad and largest rate in rad/s, without signs."""
+    """Largest magnitude of the angle from theta = 0 in rad, and of the rotation rate in rad/s."""
     if isinstance(rotation, PolynomialRotation):
         time_s = torch.arange(n_pulse + 1, dtype=torch.float64) / radar.prf_hz
         return float(rotation.angle(time_s).detach().abs().max()), float(rotation.rate(time_s).detach().abs().max())

@@ -19,7 +19,7 @@ from torch import Tensor
 from torchsar.core import Draws, per_trial
 from torchsar.scene.trials import finite_numbers, refuse_unless_finite
 
-# amplitude_frequency_phase, such as 1_0.1_90
+# form amplitude_frequency_phase, such as 1_0.1_90
 _NAME = re.compile(r"(\d+(?:\.\d+)?)_(\d+(?:\.\d+)?)_(-?\d+(?:\.\d+)?)")
 
 
