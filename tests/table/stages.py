@@ -22,7 +22,7 @@ from tests.helpers import (
     small_recording,
 )
 from torchsar import compensate, focus, multichannel, repair
-from torchsar.core import Alternate, Estimate, Signal, Stage, Turn
+from torchsar.core import Alternate, Estimate, Signal, Stage, Turn, to_frequency
 from torchsar.radar import InverseRadar
 
 RADAR = small_radar()
@@ -33,6 +33,7 @@ FEW_POINTS = partial(repair.estimate_response_sharpest, points=40, orders=(4, 8)
 
 LINE_NUMBER = "depends on the number of the line"
 ON_RANGE = "depends on the range"
+ON_DOPPLER = "depends on the Doppler frequency"
 NEW_AXIS = "transforms the axis or changes its length"
 
 
@@ -73,6 +74,7 @@ class Case:
         values: Gives, for a signal, the values per trial that the stage is called with.
         vmap: It works under `torch.vmap`.
         tolerance: Relative difference between a batch and its trials that rounding explains.
+        doppler: It works on lines that are transformed along azimuth.
         image: It works on an image of a strip in place of raw lines.
         keeps_complex: Its samples stay complex.
         n_range: Number of range cells that it needs.
@@ -88,6 +90,7 @@ class Case:
     values: Callable[[Signal], dict[str, Tensor]] = field(default=lambda signal: {})
     vmap: bool = True
     tolerance: float = 1e-9
+    doppler: bool = False
     image: bool = False
     keeps_complex: bool = True
     n_range: int = 64
@@ -214,6 +217,22 @@ CASES = [
     Case("omega_k", lambda: focus.OmegaK(RADAR), _geometry, laws=Laws(range=ON_RANGE)),
     Case("omega_k_flat", lambda: focus.OmegaK(RADAR, "flat"), _geometry, laws=Laws(range=ON_RANGE)),
     Case("omega_k_stolt", lambda: focus.OmegaKStolt(RADAR), _geometry, laws=Laws(range=ON_RANGE)),
+    Case("doppler_transform", focus.DopplerTransform, laws=Laws(pulse=NEW_AXIS)),
+    Case(
+        "correct_range_migration",
+        lambda: focus.CorrectRangeMigration(RADAR),
+        _geometry,
+        doppler=True,
+        laws=Laws(pulse=ON_DOPPLER, range=ON_RANGE),
+    ),
+    Case(
+        "azimuth_compress",
+        lambda: focus.AzimuthCompress(RADAR),
+        _geometry,
+        doppler=True,
+        laws=Laws(pulse=NEW_AXIS, range=ON_RANGE),
+    ),
+    Case("keystone", lambda: focus.Keystone(RADAR), laws=Laws(pulse="scales slow time about the middle pulse")),
     Case("range_doppler", lambda: focus.RangeDoppler(RADAR), _geometry, laws=Laws(range=ON_RANGE)),
     Case("backproject", lambda: focus.Backproject(RADAR), _geometry, laws=Laws(pulse=LINE_NUMBER, range=ON_RANGE)),
     Case(
@@ -670,4 +689,6 @@ def entering(case: Case, signal: Signal) -> Signal:
         return raw_ladar(case.ladar, trials, dtype, n_pulse)
     if case.turning:
         return raw_turning(trials, dtype, 8 * n_pulse)
+    if case.doppler:
+        return to_frequency(signal, "pulse")
     return Signal(signal.data, RADAR.image_axes(signal.axes)) if case.image else signal

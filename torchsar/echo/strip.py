@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,7 +16,7 @@ from torchsar.core.fft import smooth_length
 from torchsar.echo.recorded import Impairment, noise, recorded
 from torchsar.echo.sums import blocks, echo_spectrum
 from torchsar.radar import StripmapRadar
-from torchsar.scene import Scatterers, StripmapWorld
+from torchsar.scene import GroundMovers, Scatterers, StripmapWorld
 from torchsar.scene.trials import refuse_other_trials
 
 # size of the phase tables of a block of pulses and targets, about that of the cache of a processor
@@ -31,12 +33,44 @@ class Placed:
         zero_doppler_s: Slow time of closest approach in seconds, same shape.
         closest_m: Closest range in metres, same shape.
         amplitude: Amplitude, same shape, complex.
+        along_m_s: Along-track speed of the radar relative to the scatterer in m/s, same shape; None
+            for scatterers at rest, for which it is the effective velocity.
+        closing_m_s: Speed of the scatterer towards the track in m/s, same shape; None if at rest.
     """
 
     crossing_s: Tensor
     zero_doppler_s: Tensor
     closest_m: Tensor
     amplitude: Tensor
+    along_m_s: Tensor | None = None
+    closing_m_s: Tensor | None = None
+
+    def chosen(self, index: Any) -> Placed:
+        """Return some scatterers.
+
+        Args:
+            index: Index of tensors of shape (..., target).
+
+        Returns:
+            The chosen scatterers.
+        """
+        chosen: list[Any] = [None if x is None else x[index] for x in vars(self).values()]
+        return Placed(*chosen)
+
+    def speed_m_s(self, velocity_m_s: Tensor) -> Tensor:
+        """Return the speed at which the radar passes the scatterers.
+
+        Args:
+            velocity_m_s: Effective velocity in m/s, the speed past those at rest.
+
+        Returns:
+            Speed in m/s, broadcastable to the scatterers.
+        """
+        return (
+            velocity_m_s
+            if self.along_m_s is None or self.closing_m_s is None
+            else torch.hypot(self.along_m_s, self.closing_m_s)
+        )
 
 
 def path_geometry(
@@ -74,6 +108,51 @@ def path_geometry(
     return Placed(crossing, zero, closest, amplitude)
 
 
+def _with_movers(
+    placed: Placed,
+    world: StripmapWorld,
+    radar: StripmapRadar,
+    size: tuple[int, int],
+    draws: Draws,
+    doppler_hz: Tensor | float,
+    velocity_m_s: Tensor | float,
+) -> Placed:
+    """The scatterers at rest and the moving ones after them.
+
+    A point in uniform motion has the range history of one at rest that the radar passes in another
+    direction, at another speed.
+    """
+    if world.movers is None:
+        return placed
+    if any(isinstance(one, GroundMovers) for one in getattr(world.movers, "parts", {"": world.movers}).values()):
+        raise ValueError("movers of a strip move uniformly in the slant plane; give MovingPoints or a Ship")
+    moving = world.movers.movers(radar, draws.part("movers"))  # pyright: ignore[reportArgumentType]
+    moving = moving.each(lambda x: x.to(placed.closest_m.device))
+    begin = Scatterers(moving.y0_m, moving.range_m, moving.amplitude)
+    at = path_geometry(begin, radar, *size, doppler_hz, velocity_m_s)
+    middle_s = (size[0] // 2) / radar.prf_hz
+    velocity = per_trial(velocity_m_s, 1, at.closest_m)
+    along, closing = velocity - moving.u_a_m_s, moving.u_r_m_s
+    # position relative to the radar at the middle pulse, along the track and away from it
+    x_m, y_m = velocity * (at.zero_doppler_s - middle_s), at.closest_m
+    sin = radar.sin_squint(per_trial(doppler_hz, 1, y_m), velocity)
+    tan = sin / torch.sqrt(1 - sin.square())
+    square = along.square() + closing.square()
+    crossing = middle_s + (x_m - tan * y_m) / (along - tan * closing)
+    zero = middle_s + (along * x_m + closing * y_m) / square
+    moved = (crossing, zero, (along * y_m - closing * x_m) / square.sqrt(), at.amplitude, along, closing)
+    still = (
+        placed.crossing_s,
+        placed.zero_doppler_s,
+        placed.closest_m,
+        placed.amplitude,
+        velocity.expand(*placed.closest_m.shape[:-1], 1).expand(placed.closest_m.shape),
+        torch.zeros_like(placed.closest_m),
+    )
+    lead = np.broadcast_shapes(*(x.shape[:-1] for x in (*moved, *still)))
+    return Placed(*(torch.cat([x.expand(*lead, x.shape[-1]) for x in pair], -1) for pair in zip(still, moved)))
+
+
 def stripmap_echo(
     placed: Placed,
     world: StripmapWorld,
@@ -109,7 +188,7 @@ def stripmap_echo(
     """
     n_fft = _line_length(placed, radar, n_range)
     echo = _lines(placed, world, radar, n_pulse, n_range, n_fft, dtype)
-    if n_fft == n_range or placed.closest_m.ndim == 1:
+    if n_fft == n_range or placed.closest_m.ndim == 1 or placed.along_m_s is not None:
         return echo
     fits = _fits(placed, radar, n_range)
     if not bool(fits.any()):
@@ -146,40 +225,42 @@ def _block_spectrum(
     total = torch.zeros((*placed.closest_m.shape[:-1], pulse_s.numel(), n_fft), dtype=dtype, device=pulse_s.device)
     count = placed.closest_m.shape[-1]
     width = max(16, _TABLE_BYTES // (8 * pulse_s.numel() * 3 * math.isqrt(n_fft)))
-    for targets in (slice(first, first + width) for first in range(0, count, width)):
-        since, closest, weight = _times_and_gain(placed, targets, world, radar, pulse_s, doppler, velocity)
+    for first in range(0, count, width):
+        some = placed.chosen((..., None, slice(first, first + width)))
+        since, weight = _times_and_gain(some, world, radar, pulse_s, doppler, velocity)
         # With few targets all are summed, so that the sum of a trial does not depend on other
         # trials. Otherwise those are summed that any pulse of any trial illuminates.
         lit = slice(None) if count <= width else (weight.detach() != 0).flatten(0, -2).any(0).nonzero()[:, 0]
-        since, closest, weight = (x[..., lit] for x in (since, closest, weight))
+        some, since, weight = some.chosen((..., lit)), since[..., lit], weight[..., lit]
         if not since.shape[-1]:
             continue
-        range_m = world.path.range_m(since, closest, velocity)
+        range_m = world.path.range_m(since, some.closest_m, some.speed_m_s(velocity))
         delay = 2 * (range_m - radar.near_range_m) / radar.wave_speed_m_s
         inside = (delay > -radar.pulse.duration_s) & (delay < n_fft / radar.sampling_hz)
-        amplitude = placed.amplitude[..., None, targets][..., lit] * torch.where(inside, weight, 0)
+        amplitude = some.amplitude * torch.where(inside, weight, 0)
         turns = 2 * radar.carrier_hz / radar.wave_speed_m_s * range_m
         total = total + echo_spectrum(delay, turns, amplitude, n_fft, radar.sampling_hz / n_fft, dtype)
     return total
 
 
 def _times_and_gain(
-    placed: Placed,
-    targets: slice,
+    some: Placed,
     world: StripmapWorld,
     radar: StripmapRadar,
     pulse_s: Tensor,
     doppler_hz: Tensor,
     velocity_m_s: Tensor,
 ) -> list[Tensor]:
-    """Time since closest approach, closest range and gain, (..., pulse, target) each."""
-    crossing, zero, closest = (
-        x[..., None, targets] for x in (placed.crossing_s, placed.zero_doppler_s, placed.closest_m)
-    )
-    since = pulse_s[:, None] - zero
-    range_m = torch.sqrt(closest.square() + (velocity_m_s * since).square())
-    offset = 2 * velocity_m_s.square() * -since / (radar.wavelength_m * range_m) - doppler_hz
-    return torch.broadcast_tensors(since, closest, world.beam.weight(pulse_s[:, None] - crossing, offset, velocity_m_s))
+    """Time since closest approach and gain, (..., pulse, target), of those (..., 1, target)."""
+    since, speed = pulse_s[:, None] - some.zero_doppler_s, some.speed_m_s(velocity_m_s)
+    range_m = torch.sqrt(some.closest_m.square() + (speed * since).square())
+    if some.along_m_s is None or some.closing_m_s is None:
+        ahead = velocity_m_s.square() * -since
+    else:  # the beam knows directions, not the speed of the target
+        ahead = -velocity_m_s * (some.along_m_s * since + some.closing_m_s / speed * some.closest_m)
+    offset = 2 * ahead / (radar.wavelength_m * range_m) - doppler_hz
+    weight = world.beam.weight(pulse_s[:, None] - some.crossing_s, offset, velocity_m_s)
+    return torch.broadcast_tensors(since, weight)
 
 
 def _true_doppler(world: StripmapWorld, radar: StripmapRadar) -> Tensor | float:
@@ -195,7 +276,7 @@ def _line_length(placed: Placed, radar: StripmapRadar, n_range: int) -> int:
         2 * (float(closest) - radar.near_range_m) / radar.wave_speed_m_s * radar.sampling_hz
         for closest in placed.closest_m.detach().aminmax()
     )
-    if first >= 0 and last + _margin(radar) <= n_range:
+    if first >= 0 and last + _margin(radar) <= n_range and placed.along_m_s is None:
         return n_range
     return smooth_length(n_range + radar.pulse_samples)
 
@@ -232,7 +313,8 @@ def target_energy(truth: Truth, world: StripmapWorld, radar: StripmapRadar, n_pu
     placed = Placed(crossing, values["zero_doppler_s"], values["closest_range_m"], values["amplitude"])
     pulse_s = torch.arange(n_pulse, dtype=torch.float64, device=crossing.device) / radar.prf_hz
     velocity, doppler = (per_trial(values[name], 2, pulse_s) for name in ("velocity_m_s", "doppler_hz"))
-    weight = _times_and_gain(placed, slice(None), world, radar, pulse_s, doppler, velocity)[2]
+    some = placed.chosen((..., None, slice(None)))
+    weight = _times_and_gain(some, world, radar, pulse_s, doppler, velocity)[1]
     return radar.pulse.duration_s * radar.sampling_hz * values["amplitude"].abs().square() * weight.square().sum(-2)
 
 
@@ -286,7 +368,8 @@ def simulate(
 
         - of the targets, shape (..., target): `crossing_s`, the time at which the beam centre
           crosses the target, and `zero_doppler_s`, both in seconds; `closest_range_m` in metres;
-          `amplitude`, complex;
+          `amplitude`, complex; with moving targets, which follow those of the scene, the speeds
+          `u_a_m_s` along the track and `u_r_m_s`, closing positive;
         - shape (...,) or (): the effective velocity `velocity_m_s`; the Doppler frequency
           `doppler_hz` of the beam centre; the standard deviation `noise_std` of the complex noise
           of a sample;
@@ -305,6 +388,7 @@ def simulate(
     scatterers = world.scene.scatterers(draws).to(device)
     _refuse_impossible(radar, n_range, radar.sin_squint(doppler, velocity))
     placed = path_geometry(scatterers, radar, n_pulse, n_range, doppler, velocity)
+    placed = _with_movers(placed, world, radar, (n_pulse, n_range), draws, doppler, velocity)
     if bool((placed.closest_m <= 0).any()):
         raise ValueError(
             f"a target lies behind the radar, at a range of {float(placed.closest_m.min()):.4g} "
@@ -324,6 +408,11 @@ def simulate(
         "doppler_hz": torch.as_tensor(doppler, dtype=torch.float64),
         "noise_std": std,
     }
+    if placed.along_m_s is not None and placed.closing_m_s is not None:
+        values |= {
+            "u_a_m_s": per_trial(velocity, 1, placed.along_m_s) - placed.along_m_s,
+            "u_r_m_s": placed.closing_m_s,
+        }
     return recorded(echo, echo, radar.raw_axes(n_pulse, n_range), radar, values, impairments, draws)
 
 

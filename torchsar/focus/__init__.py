@@ -6,6 +6,8 @@ data or task                           what to use
 raw strip, swath of moderate width     `omega_k`; many recordings of one geometry `StoredOmegaK`
 raw strip, wide swath or large squint  `omega_k_stolt`
 raw strip, baseline and reference      `range_doppler`; `backproject_strip`, exact, for patches
+the steps of range-Doppler             `RangeCompress`, `DopplerTransform`, `CorrectRangeMigration`,
+                                       `AzimuthCompress`
 strip longer than memory               `plan_strip`, `focus_strip`, `write_strip`; overlap
                                        `reach_lines`
 strip: zero padding, other axes        `PaddedLines`; `closest_range`
@@ -35,7 +37,7 @@ Most functions are stages of chains, too: `OmegaK` calls `omega_k`, and so on. `
 """
 
 from torchsar.focus.backprojection import backproject
-from torchsar.focus.chirp_z import chirp_z, keystone
+from torchsar.focus.chirp_z import Keystone, chirp_z, keystone
 from torchsar.focus.coordinates import ClosestRange, PaddedLines, closest_range
 from torchsar.focus.dechirped import AzimuthTransform, CompressDechirped, azimuth_transform, compress_dechirped
 from torchsar.focus.detection import Detect, QuickLook, amplitude, multilook, to_db
@@ -56,7 +58,13 @@ from torchsar.focus.omega_k import OmegaK, omega_k
 from torchsar.focus.path_image import DirectImage, OmegaKImage, PathImage, TileImage
 from torchsar.focus.polar import PolarFormat, PolarOperator
 from torchsar.focus.processed_beam import ProcessedBeam
-from torchsar.focus.range_doppler import RangeDoppler, range_doppler
+from torchsar.focus.range_doppler import (
+    AzimuthCompress,
+    CorrectRangeMigration,
+    DopplerTransform,
+    RangeDoppler,
+    range_doppler,
+)
 from torchsar.focus.reference import RangeCompress, range_compress
 from torchsar.focus.requirements import requirements
 from torchsar.focus.spotlight import SpotlightBackprojection, backproject_spotlight
@@ -78,6 +86,7 @@ from torchsar.focus.triangular import (
 )
 
 __all__ = [
+    "AzimuthCompress",
     "AzimuthMatchedFilter",
     "AzimuthTransform",
     "Backproject",
@@ -85,15 +94,18 @@ __all__ = [
     "CompiledNufft",
     "CompressDechirped",
     "CompressSweeps",
+    "CorrectRangeMigration",
     "CrossRangeLines",
     "DerampAzimuth",
     "Detect",
     "DirectImage",
     "DopplerLines",
+    "DopplerTransform",
     "ExplicitSum",
     "FocusStrip",
     "Gridding",
     "ImageGrid",
+    "Keystone",
     "MatchedFourier",
     "MatchedFourierOperator",
     "MotionCompensation",

@@ -11,10 +11,21 @@ Reference:
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
-from torchsar.core import centred_fft, checked_samples, host_value, linear_phasor, per_trial, unit_phasor
+from torchsar.core import (
+    Signal,
+    Stage,
+    centred_fft,
+    checked_samples,
+    host_value,
+    linear_phasor,
+    per_trial,
+    unit_phasor,
+)
 from torchsar.core.fft import smooth_length
 
 
@@ -125,3 +136,48 @@ def keystone(data: Tensor, frequency_hz: Tensor, carrier_hz: float, ambiguity: T
     rows = chirp_z(doppler, scale * (n // 2) / n, -scale / n, n)
     turns = (scale * per_trial(ambiguity, 1, data))[..., None]
     return (rows * linear_phasor(turns[..., 0], -(n // 2), n, data.dtype)).mT
+
+
+class Keystone(Stage):
+    """Stage that removes the linear range walk of all targets by the keystone transform.
+
+    >>> import torch
+    >>> from torchsar import Signal, focus, radar
+    >>> isar = radar.InverseRadar(1e10, 1e9, 500.0)
+    >>> t, f = (torch.arange(64.0)[:, None] - 32) / 500, (torch.arange(32.0) - 16) / 32 * 1e9
+    >>> echo = torch.exp(-4j * torch.pi / 299792458 * (1e10 + f) * 7.0 * t)  # recedes at 7 m/s
+    >>> profiles = Signal(radar.range_profiles(echo), isar.raw_axes(64, 32))
+    >>> for signal in (profiles, focus.Keystone(isar, ambiguity=-1)(profiles)):
+    ...     print(signal.data[::21].abs().argmax(-1).tolist())
+    [13, 15, 17, 19]
+    [16, 16, 16, 16]
+
+    It works on range-compressed lines of any radar; see `keystone`.
+
+    Args:
+        radar: Radar of the recording: carrier and propagation speed.
+        ambiguity: Number of pulse rates by which the true Doppler exceeds the sampled one, unless
+            it is connected.
+    """
+
+    takes_empty = False
+
+    def __init__(self, radar: Any, ambiguity: int = 0) -> None:
+        super().__init__()
+        self.radar, self.ambiguity = radar, ambiguity
+
+    def forward(self, signal: Signal, ambiguity: Tensor | None = None) -> Signal:
+        """Straighten the range history of targets of constant velocity.
+
+        Args:
+            signal: Range-compressed lines with the axes (pulse, range).
+            ambiguity: Number of pulse rates; None for that of the stage.
+
+        Returns:
+            Signal of the same axes.
+        """
+        step_s = 2 * signal.axes[-1].step / self.radar.wave_speed_m_s
+        frequency_hz = torch.fft.fftfreq(signal.axes[-1].n, step_s, dtype=torch.float64, device=signal.data.device)
+        spectrum = torch.fft.fft(signal.data)
+        number = self.ambiguity if ambiguity is None else ambiguity
+        return signal.with_data(torch.fft.ifft(keystone(spectrum, frequency_hz, self.radar.carrier_hz, number)))

@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
-from torchsar.core import checked_samples, linear_phasor, real_dtype, unit_phasor
+from torchsar.core import (
+    Signal,
+    Stage,
+    checked_samples,
+    from_frequency,
+    linear_phasor,
+    real_dtype,
+    to_frequency,
+    unit_phasor,
+)
 from torchsar.focus.frame_geometry import FrameGeometry
 from torchsar.focus.nufft import Nufft, Points
 from torchsar.focus.omega_k import STATIONARY_TURNS, Focuser, refocus_turns_per_sample, through_doppler
@@ -76,27 +87,38 @@ def range_doppler(
     """
     raw = checked_samples(raw, "range_doppler", "pulse, range", finite=False)
     geometry = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz, band_hz=band_hz)
-    n, centre, real = raw.shape[-1], raw.shape[-1] // 2, real_dtype(raw.dtype)
+    n = raw.shape[-1]
     plan = Nufft(n, eps, raw.dtype, raw.device)
-    per_sample = plan.length / n
-    cell = torch.arange(n, dtype=torch.float64, device=raw.device)
-    range_cells = cell + radar.near_range_m / radar.range_step_m
-    centre_cells = centre + radar.near_range_m / radar.range_step_m
 
     def focus_rows(rows: Tensor, part: slice) -> Tensor:
         at = geometry.rows(part)
         spectrum = rows if reference is None else rows * reference.to(rows.dtype)
-        # Cell i of the image lies at cell i + range_cells * migration of the row. The exponent is
-        # +2j pi k q / n, so that points have the opposite sign.
-        start = migration(at) * centre_cells
-        shift = start[..., None] + migration(at)[..., None] * (range_cells - centre_cells)
-        points = Points.of(plan.kernel, -per_sample * cell, plan.length, real, -per_sample * shift)
-        turns = refocus_turns_per_sample(at)
-        constant = unit_phasor(turns * centre_cells + STATIONARY_TURNS, raw.dtype) / n
-        lines = plan.type2(torch.fft.fftshift(spectrum, dim=-1), points)
-        return at.weighted(lines * linear_phasor(turns, -centre, n, raw.dtype) * constant[..., None])
+        return _compressed(_aligned(spectrum, at, plan), at, n)
 
     return through_doppler(raw, focus_rows, differentiable=geometry.requires_grad or raw.requires_grad)
+
+
+def _aligned(spectrum: Tensor, at: FrameGeometry, plan: Nufft) -> Tensor:
+    """Lines (..., d, range) without range migration, times their number of samples, from their
+    spectra over range frequency.
+    """
+    n, near = spectrum.shape[-1], at.radar.near_range_m / at.radar.range_step_m
+    cell = torch.arange(n, dtype=torch.float64, device=spectrum.device)
+    centre_cells, per_sample = n // 2 + near, plan.length / n
+    # Cell i of the image lies at cell i + (i + near) * migration of the row. The exponent is
+    # +2j pi k q / n, so that points have the opposite sign.
+    start = migration(at) * centre_cells
+    shift = start[..., None] + migration(at)[..., None] * ((cell + near) - centre_cells)
+    points = Points.of(plan.kernel, -per_sample * cell, plan.length, real_dtype(spectrum.dtype), -per_sample * shift)
+    return plan.type2(torch.fft.fftshift(spectrum, dim=-1), points)
+
+
+def _compressed(lines: Tensor, at: FrameGeometry, scale: int = 1) -> Tensor:
+    """Lines (..., d, range) times the azimuth filter of each range, over a number."""
+    n, near = lines.shape[-1], at.radar.near_range_m / at.radar.range_step_m
+    turns = refocus_turns_per_sample(at)
+    constant = unit_phasor(turns * (n // 2 + near) + STATIONARY_TURNS, lines.dtype) / scale
+    return at.weighted(lines * linear_phasor(turns, -(n // 2), n, lines.dtype) * constant[..., None])
 
 
 class RangeDoppler(Focuser):
@@ -113,3 +135,158 @@ class RangeDoppler(Focuser):
     """
 
     form = staticmethod(range_doppler)
+
+
+class DopplerTransform(Stage):
+    """Stage that transforms range-compressed lines along azimuth: step 2 of range-Doppler.
+
+    >>> import torch
+    >>> from torchsar import Signal, focus, radar
+    >>> sensor = radar.StripmapRadar(carrier_hz=3.2e9, pulse=radar.LinearFM(40e6, 0.5e-6),
+    ...     sampling_hz=48e6, prf_hz=400.0, velocity_m_s=120.0, near_range_m=4000.0)
+    >>> lines = Signal(torch.ones(4, 2, dtype=torch.complex64), sensor.raw_axes(4, 2))
+    >>> focus.DopplerTransform()(lines).axes[0].values()
+    tensor([-200., -100.,    0.,  100.], dtype=torch.float64)
+
+    The Doppler axis is that within one PRF about zero. Step 1 is `RangeCompress`, step 3
+    `CorrectRangeMigration`, and step 4 `AzimuthCompress`.
+    """
+
+    def forward(self, signal: Signal) -> Signal:
+        """Transform a signal along its pulses.
+
+        Args:
+            signal: Signal with axes (pulse, range).
+
+        Returns:
+            Signal with axes (doppler, range).
+        """
+        return to_frequency(signal, "pulse")
+
+
+class _DopplerStep(Stage):
+    """Base of the steps of range-Doppler that work on Doppler rows."""
+
+    works_on = ("doppler", "range")
+    takes_empty = False
+    velocity_m_s: Tensor
+    doppler_hz: Tensor
+
+    def __init__(
+        self,
+        radar: StripmapRadar,
+        velocity_m_s: Tensor | float | None = None,
+        doppler_hz: Tensor | float | None = None,
+        frame_hz: float | None = None,
+        band_hz: float | None = None,
+    ) -> None:
+        super().__init__()
+        self.radar, self.frame_hz, self.band_hz = radar, frame_hz, band_hz
+        self.hold("velocity_m_s", radar.velocity_m_s if velocity_m_s is None else velocity_m_s)
+        self.hold("doppler_hz", (radar.pointing_doppler_hz or 0.0) if doppler_hz is None else doppler_hz)
+
+    def forward(self, signal: Signal, doppler_hz: Tensor | None = None, velocity_m_s: Tensor | None = None) -> Signal:
+        """Process Doppler rows.
+
+        Args:
+            signal: Signal with axes (doppler, range), from `DopplerTransform`.
+            doppler_hz: Doppler centroid in Hz; None for that of the stage.
+            velocity_m_s: Effective velocity in m/s; None for that of the stage.
+
+        Returns:
+            The rows after this step.
+
+        Raises:
+            ValueError: If a Doppler frequency, the velocity or the processed band is not valid, see
+                `range_doppler`.
+        """
+        of = FrameGeometry.of(
+            replace(self.radar, near_range_m=signal.axes[-1].start),
+            signal.data,
+            self.doppler_hz if doppler_hz is None else doppler_hz,
+            self.velocity_m_s if velocity_m_s is None else velocity_m_s,
+            self.frame_hz,
+            band_hz=self.band_hz,
+        )
+        # from the order of an FFT to that of the axis
+        weight = None if of.weight is None else torch.fft.fftshift(of.weight, dim=-1)
+        return self._done(signal, replace(of, doppler_hz=torch.fft.fftshift(of.doppler_hz, dim=-1), weight=weight))
+
+    def _done(self, signal: Signal, at: FrameGeometry) -> Signal:
+        raise NotImplementedError
+
+
+class CorrectRangeMigration(_DopplerStep):
+    """Stage that corrects range cell migration (RCMC): step 3 of range-Doppler.
+
+    >>> from torchsar import Chain, Draws, echo, focus, radar, scene
+    >>> sensor = radar.StripmapRadar(carrier_hz=3.2e9, pulse=radar.LinearFM(40e6, 0.5e-6),
+    ...     sampling_hz=48e6, prf_hz=400.0, velocity_m_s=120.0, near_range_m=4000.0)
+    >>> world = scene.StripmapWorld(scene.Points([0.0], [0.0]), scene.Dwell(0.6))
+    >>> chain = Chain(
+    ...     echo=echo.Simulate(sensor, world, n_pulse=256, n_range=96),
+    ...     compress=focus.RangeCompress(sensor),
+    ...     doppler=focus.DopplerTransform(),
+    ...     rcmc=focus.CorrectRangeMigration(sensor),
+    ...     azimuth=focus.AzimuthCompress(sensor),
+    ... )
+    >>> divmod(int(chain(draws=Draws(1)).data.abs().argmax()), 96)  # line and sample of the peak
+    (128, 36)
+
+    In each Doppler row a target lies at a longer range than at the Doppler frequency of the image
+    coordinates. The rows are resampled, by interpolation of relative error `eps`, so that every
+    target lies in one range cell. Together the four steps equal `RangeDoppler`.
+
+    Args:
+        radar: Radar of the recording.
+        velocity_m_s: Effective velocity in m/s; None for that of the radar.
+        doppler_hz: Absolute Doppler centroid in Hz, about which the rows are unwrapped; None for
+            the nominal pointing of the radar, or 0 where it has none.
+        frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates;
+            None for the nominal pointing of the radar, or for the centroid where it has none.
+        eps: Relative error of the interpolation.
+    """
+
+    def __init__(
+        self,
+        radar: StripmapRadar,
+        velocity_m_s: Tensor | float | None = None,
+        doppler_hz: Tensor | float | None = None,
+        frame_hz: float | None = None,
+        eps: float = 2e-4,
+    ) -> None:
+        super().__init__(radar, velocity_m_s, doppler_hz, frame_hz)
+        self.eps = eps
+
+    def _done(self, signal: Signal, at: FrameGeometry) -> Signal:
+        n, data = signal.data.shape[-1], signal.data
+        plan = Nufft(n, self.eps, data.dtype, data.device)
+        return signal.with_data(_aligned(torch.fft.fft(data), at, plan) / n)
+
+
+class AzimuthCompress(_DopplerStep):
+    """Stage that compresses azimuth and forms the image: step 4 of range-Doppler.
+
+    >>> import torch
+    >>> from torchsar import Signal, focus, radar
+    >>> sensor = radar.StripmapRadar(carrier_hz=3.2e9, pulse=radar.LinearFM(40e6, 0.5e-6),
+    ...     sampling_hz=48e6, prf_hz=400.0, velocity_m_s=120.0, near_range_m=4000.0)
+    >>> lines = Signal(torch.ones(8, 4, dtype=torch.complex64), sensor.raw_axes(8, 4))
+    >>> focus.AzimuthCompress(sensor)(focus.DopplerTransform()(lines)).names
+    ('azimuth', 'range')
+
+    Each row is multiplied by the conjugate phase of the echo of each range, and transformed back.
+
+    Args:
+        radar: Radar of the recording.
+        velocity_m_s: Effective velocity in m/s; None for that of the radar.
+        doppler_hz: Absolute Doppler centroid in Hz, about which the rows are unwrapped; None for
+            the nominal pointing of the radar, or 0 where it has none.
+        frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates;
+            None for the nominal pointing of the radar, or for the centroid where it has none.
+        band_hz: Processed Doppler bandwidth in Hz; None for the whole PRF.
+    """
+
+    def _done(self, signal: Signal, at: FrameGeometry) -> Signal:
+        lines = from_frequency(signal.with_data(_compressed(signal.data, at)), "doppler")
+        return Signal(lines.data, self.radar.image_axes(lines.axes))

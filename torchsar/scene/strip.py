@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchsar.radar import StripmapRadar
+from torchsar.scene.movers import MovingScene
 from torchsar.scene.targets import Scene
 from torchsar.scene.trials import finite_numbers, with_dims
 
@@ -253,6 +254,9 @@ class StripmapWorld:
             pointing of the radar.
         snr_db: Mean signal power of the illuminated raw samples over the noise variance in
             decibels, None for no noise.
+        movers: Moving targets, such as MovingPoints, None for none. Their positions are those at
+            the middle pulse, in the frame of the scene, and their speeds those along the track and
+            along the closest range.
 
     Raises:
         ValueError: If a number is not finite.
@@ -264,3 +268,4 @@ class StripmapWorld:
     velocity_m_s: Tensor | float | None = None
     doppler_hz: Tensor | float | None = None
     snr_db: Tensor | float | None = None
+    movers: MovingScene | None = None

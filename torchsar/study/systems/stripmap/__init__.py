@@ -22,7 +22,7 @@ from torchsar.io import read_stripmap
 from torchsar.metrics import contrast, correlation, entropy, error_db, impulse_response
 from torchsar.metrics.bounds import reference_doppler_std_hz, tone_frequency_bound_hz, velocity_bound_m_s
 from torchsar.radar import StripmapRadar
-from torchsar.scene import AlwaysLit, Hyperbola, Points, RandomPoints, Scene, StripmapWorld, Together
+from torchsar.scene import AlwaysLit, Hyperbola, MovingPoints, Points, RandomPoints, Scene, StripmapWorld, Together
 from torchsar.scene.strip import Beam, Path
 from torchsar.study.names.registry import BEAMS, IMPAIRMENTS, PATHS, SCENES, with_wavelength
 from torchsar.study.output.report import Drawn, comparisons
@@ -51,6 +51,7 @@ class Strip(World):
         velocity_m_s: True effective velocity in m/s; None for the nominal one of the radar.
         doppler_hz: True Doppler centroid in Hz; None for the nominal pointing of the radar.
         squint_deg: True squint of the beam in degrees, as an alternative to doppler_hz.
+        movers: Moving points besides the scene; null for none.
         noise: Receiver noise; the SNR is that of raw samples that contain signal.
         impairments: Impairments of the recording by name, in the order of their effect.
     """
@@ -64,6 +65,7 @@ class Strip(World):
     velocity_m_s: Tensor | float | None = None
     doppler_hz: Tensor | float | None = None
     squint_deg: Tensor | float | None = None
+    movers: MovingPoints | None = None
     noise: Noise = field(default_factory=Noise)
     impairments: Mapping[str, Annotated[Impairment, IMPAIRMENTS]] = field(default_factory=dict)
 
@@ -87,7 +89,7 @@ class Strip(World):
     def of(self, radar: StripmapRadar) -> StripmapWorld:
         """The parameters of the echo simulation."""
         doppler, scene = self.doppler(radar), Together(self.scene)
-        return StripmapWorld(scene, self.beam, self.path, self.velocity_m_s, doppler, self.noise.snr_db)
+        return StripmapWorld(scene, self.beam, self.path, self.velocity_m_s, doppler, self.noise.snr_db, self.movers)
 
     def simulation(self, radar: StripmapRadar, dtype: torch.dtype) -> Simulate:
         return Simulate(radar, self.of(radar), self.lines, self.samples, dtype=dtype, impairments=self.impairments)
@@ -347,7 +349,8 @@ class Stripmap(System):
         truth, world, radar = batch.trials.truth, batch.trials.own, bench.radar
         std = truth["noise_std"]
         if (
-            not all(isinstance(scene, (Points, RandomPoints)) for scene in world.scene.parts.values())
+            world.movers is not None
+            or not all(isinstance(scene, (Points, RandomPoints)) for scene in world.scene.parts.values())
             or not (std > 0).all()
         ):
             return {}
