@@ -4,9 +4,10 @@ The absolute centroid f_dc is the baseband centroid plus k PRFs. The whole numbe
 is found without prior knowledge. Three kinds of evidence give a log-likelihood for each candidate
 k:
 
-- Looks: the image is focused with the baseband centroid. If the true centroid lies k PRFs away, two
-  azimuth looks whose Doppler centres differ by df are displaced against each other in range by
-  lambda k PRF df / (2 Ka), with wavelength lambda and azimuth FM rate Ka.
+- Looks: the image is focused with the baseband centroid, and two azimuth looks are formed whose
+  Doppler centres differ by df. If the true centroid is k PRFs away, the looks are displaced against
+  each other in range by lambda k PRF df / (2 Ka). Here lambda is the wavelength and Ka the azimuth
+  FM rate.
 - Lines: the phase increment between adjacent lines is proportional to f_dc (f0 + f) / f0, with the
   range frequency f and the carrier frequency f0. Its slope over f gives f_dc without ambiguity.
 - Entropy: a small group of range cells is focused with each candidate. The right candidate gives

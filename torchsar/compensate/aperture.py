@@ -92,7 +92,7 @@ def _refined(
     line = (torch.arange(products.shape[-2], dtype=torch.float64, device=raw.device) + 0.5) * tile
     total, whole, phase = doppler_hz, torch.ones_like(power), torch.zeros_like(doppler_hz)
     for _ in range(8):
-        # if the Doppler of the frame has an error d, targets appear late by d / rate
+        # an error d of the assumed Doppler frequency delays the targets by d / rate
         shift = (total - doppler_hz)[..., None, None] / rate * radar.prf_hz
         whole = _whole(line[:, None] - shift, raw.shape[-2], dwell)
         chosen = (products * whole).sum((-2, -1))

@@ -90,7 +90,7 @@ class Increments(NamedTuple):
         parts = (-1, x[..., : last + 1, :]), (1, x[..., -last - 1 :, :])
         mean = [sign * (part[..., :-1, :].conj() * part[..., 1:, :]).sum(-2) / last for sign, part in parts]
         ends = torch.stack(mean, -2).to(torch.complex128).tensor_split(products.shape[-1], -1)
-        # for a narrow band about half_band * dwell / 6
+        # number of lines that the ends affect; about half_band * dwell / 6 for a narrow band
         lines = (1 - half_band / torch.tan(half_band)) * dwell / (2 * half_band)
         ends = torch.stack([some.sum(-1) for some in ends], -1) * lines[..., None, None]
         return Increments(products, power, half_band, ends, coherent, prf_hz / (2 * math.pi))
@@ -131,9 +131,9 @@ def baseband(found: Estimate, lines: Increments) -> Estimate:
         along = torch.nn.functional.pad((power[..., 1:] * power[..., :-1]).sqrt(), (1, 1)).diff(dim=-1)
         slope = (terms * along).sum(-1, keepdim=True) / or_one(along.square().sum(-1, keepdim=True))
         terms = (terms - slope * along) * math.sqrt(terms.shape[-1] / (terms.shape[-1] - 2))
-    # If few blocks hold most of the energy, few targets are cut by the ends of the record, and
-    # their density is not even. For a beam of constant gain, the first moment of a cut target
-    # scatters by sqrt(1/5).
+    # If most of the energy is in few blocks, few targets are cut by the ends of the record, and
+    # they are not distributed evenly. For a beam of constant gain, the first moment of a cut target
+    # has a standard deviation of sqrt(1/5).
     share = blocks.real.clamp(0, 1).square().sum(-1)
     scatter = (terms.square() + (0.45 * share[..., None] * cuts.sum(-2)).square()).sum(-1).sqrt().clamp_max(math.pi)
     scatter, shift = torch.where(some, scatter, math.pi), cuts.sum((-2, -1)).clamp(-1, 1)

@@ -8,9 +8,10 @@ half cell, where it is band-limited and can be shifted by any fraction of a cell
 
 A range cell with many scatterers is speckle: its power in a pulse has an exponential distribution.
 The mean T of this distribution, noise included, is estimated from all pulses. The log-likelihood of
-a shift is then the correlation of |s|^2 with -1 / T. On a simulated aircraft (as in Ruan et al.
-2013, Fig. 2) the single pulses have half the jitter that they have with the usual correlation of
-|s| with its mean, and a polynomial of slow time can be fitted at an SNR of -10 dB per sample.
+a shift is then the correlation of |s|^2 with -1 / T. This was tried on a simulated aircraft (as in
+Ruan et al. 2013, Fig. 2). The shifts of single pulses have half the jitter that they have with the
+usual correlation of |s| with its mean. A polynomial of slow time can be fitted at an SNR of -10 dB
+per sample.
 """
 
 from __future__ import annotations

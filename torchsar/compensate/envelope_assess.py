@@ -55,7 +55,8 @@ def deviation(
     if std is not None:
         agree = (apart.square().sum(-1) / count).sqrt() < GOOD_CELLS
         return std, agree & (std < GOOD_CELLS / 2)
-    # if the halves of a pulse differ by far more, one of them was aligned at a wrong maximum
+    # a larger difference between the shifts of both halves of the band means that one of them was
+    # found at a wrong maximum
     usual = 4.0 * robust_std(apart.abs(), present)
     agree = (apart.abs() > usual).sum(-1) <= 0.05 * count
     envelopes = Envelopes.of(lines)
@@ -84,8 +85,8 @@ def assessed(found: Estimate, std: Tensor, agree: Tensor, cells: int) -> Estimat
         (Outcome.INEXACT, std >= GOOD_CELLS),
         (Outcome.PARTS_DISAGREE, ~agree),
         (Outcome.TOO_FEW, (count < 2) | (cells < _LEAST_RANGE_CELLS)),
-        # In noise, polynomials have 0.6 of the standard deviation of random positions in the
-        # window. Single pulses have 0.28, from the halves of the band.
+        # In pure noise, a fitted polynomial has 0.6 of the standard deviation of random positions
+        # in the window. Shifts of single pulses from both halves of the band have 0.28.
         (Outcome.NOISE, (std > 0.15 * random) & (count >= 2) & (cells >= _LEAST_RANGE_CELLS)),
         (Outcome.EMPTY, count == 0),
     )

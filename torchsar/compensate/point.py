@@ -1,12 +1,12 @@
 """Doppler centroid of the beam from the position of one point in a focused image.
 
-A focused image holds each point at the time when its Doppler equals the frame Doppler, a constant
-that was set when the image was focused. If the time is known at which the beam centre crosses a
-point, such as a corner reflector, the azimuth position of the point in the image therefore gives
-its Doppler at that time, which is the Doppler centroid. The standard deviation is
-0.39 / (T sqrt(q)) in Hz, the Cramer-Rao bound of a tone of duration T in seconds with the SNR q
-after compression (a power ratio). No estimator that uses the envelope of the beam's spectrum
-reaches this accuracy from one point.
+A focused image shows each point at the time when its Doppler equals the frame Doppler, a constant
+that was set when the image was focused. Assume that the time is known at which the beam centre
+crosses a point, such as a corner reflector. The azimuth position of the point in the image then
+gives its Doppler at that time, which is the Doppler centroid. The standard deviation is 0.39 / (T
+sqrt(q)) in Hz, the Cramer-Rao bound of a tone of duration T in seconds with the SNR q after
+compression (a power ratio). No estimator that uses the envelope of the beam's spectrum reaches this
+accuracy from one point.
 
 Reference: Tsvetkov 2017, text after Fig. 5.
 """

@@ -84,8 +84,8 @@ def assessed(
         (Outcome.INEXACT, std >= most),
         (Outcome.MISFIT, torch.full_like(inside, short)),
         (Outcome.OUTSIDE_SEARCH, ~inside),
-        # In standard deviations, the depth is below 5 in noise and in clutter that fills the
-        # Doppler band evenly. At 20 dB above the noise it is above 100.
+        # The depth of the minimum is given in standard deviations. It is below 5 in noise and in
+        # clutter that fills the Doppler band evenly, and above 100 at 20 dB above the noise.
         (Outcome.NOISE, ~((curvature > 0) & (depth > 8.0 * _noise_std(nominal, weight)))),
         (Outcome.EMPTY, (group.data == 0).all((-2, -1))),
     )

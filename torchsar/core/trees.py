@@ -1,10 +1,10 @@
 """Signals, recordings, truths and estimates as trees of tensors for torch.func and data loaders.
 
 Importing this module registers them with torch.utils._pytree, so that `torch.func.vmap`, `grad` and
-the other transforms accept and return them, and with torch.utils.data.default_collate, so that a
-DataLoader stacks them into a batch with a new leading trial dimension. The tensors are the leaves
-of the tree. All else (axes, radar, names, neutral values that are numbers) is part of its
-structure and stays as it is.
+the other transforms accept and return them. It also registers them with
+torch.utils.data.default_collate, so that a DataLoader stacks them into a batch with a new leading
+trial dimension. The tensors are the leaves of the tree. All else (axes, radar, names, neutral
+values that are numbers) is part of its structure and does not change.
 """
 
 from __future__ import annotations

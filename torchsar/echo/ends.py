@@ -92,7 +92,7 @@ class Simulate(nn.Module):
         self.radar, self.world, self.size = radar, world, (n_pulse, n_range)
         self.by, self.options = by, {"dtype": dtype, **options}
         self.connects = _connects(world)
-        # moves with the chain, and so tells its device
+        # an empty buffer, which moves with the chain and thus has its device
         self.register_buffer("place", torch.empty(0), persistent=False)
 
     def extra_repr(self) -> str:

@@ -158,7 +158,7 @@ def numbered(recording: Recording) -> Recording:
 def _applied(
     recording: Recording, impairments: Mapping[str, Impairment], draws: Draws
 ) -> tuple[Recording, dict[str, Tensor]]:
-    """The same for a recording as it is."""
+    """Apply impairments to a recording without adding line numbers."""
     true_values: dict[str, Tensor] = {}
     for name, impairment in impairments.items():
         recording, values = impairment(recording, draws.part(name))

@@ -174,7 +174,8 @@ def inverse_requirements(
     drift = push * aperture_s * linear * coupling
     shaken = sum(abs(a) * 2 * math.pi * f for a, f in vibrations) * coupling
     inside = push + sum(abs(a) * (2 * math.pi * f) ** 2 for a, f in vibrations)
-    blur = 2 * math.pi * chirp * 2 * half2 / radar.wave_speed_m_s  # in rad per m/s
+    # blur in rad for a velocity of 1 m/s
+    blur = 2 * math.pi * chirp * 2 * half2 / radar.wave_speed_m_s
     video = math.pi * chirp * (2 * range_m / radar.wave_speed_m_s) ** 2
     return (
         *rows,

@@ -1,10 +1,10 @@
 """Motion compensation of a nearly straight path, so that omega-K can image its data.
 
 The nominal track is a straight line, see `StraightTrack`. A pulse at the coordinate u along the
-track has the deviation d from it, perpendicular to the track. A point of the imaged plane lies at
-the closest range R in the direction of the unit vector e(R), and is seen at the angle theta ahead
-of broadside, at the range r = R / cos(theta) from the nominal track. From the true position its
-range is
+track has the deviation d from it, perpendicular to the track. A point of the imaged plane has the
+closest range R in the direction of the unit vector e(R). It is seen at the angle theta ahead of
+broadside, at the range r = R / cos(theta) from the nominal track. From the true position its range
+is
 
     r' = sqrt(r^2 - 2 R e.d + |d|^2),    D(theta, R) = r' - r = -cos(theta) e.d + O(|d|^2 / r).
 
@@ -20,14 +20,14 @@ What remains for a point (theta, R) at the frequency f0 + g is the phase
 
     phi = (4 pi / c) [f0 (D(theta, R) - D2(r)) + g (D(theta, R) - D1)],
 
-where D1 and D2 are the corrections of the first and of both orders. To first order in d it has
-three parts: the change of D with the angle, -(cos(theta) - cos(m)) e.d, which a narrow beam would
-not have; the correction of a range cell in place of a closest range, since a point migrates over
-cells while it is seen, cos(m) (R cos(m) / cos(theta) - R) (de/dR).d; and the envelope that the
-second order does not move. For white noise each pulse, range, angle and frequency contributes
-independently to the image, so that the relative image error is the mean of |exp(j phi) - 1|^2 over
-them, which `MotionCompensation.predicted_db` evaluates. For points in a beam the mean over angles
-is weighted by the pattern of the antenna.
+where D1 and D2 are the corrections of the first and of both orders. To first order in d, phi has
+three parts. The first is the change of D with the angle, -(cos(theta) - cos(m)) e.d, which a narrow
+beam would not have. The second is cos(m) (R cos(m) / cos(theta) - R) (de/dR).d: a point migrates
+over range cells while it is seen, and each range cell is corrected instead of each closest range.
+The third is the envelope, which the second order does not move. For white noise each pulse, range,
+angle and frequency contributes independently to the image. The relative image error is therefore
+the mean of |exp(j phi) - 1|^2 over them, which `MotionCompensation.predicted_db` evaluates. For
+points in a beam the mean over angles is weighted by the pattern of the antenna.
 
 Uneven steps along the track are resampled by a non-uniform Fourier transform, the sum over pulses
 in which backprojection also adds them, with the weight of the processed beam.

@@ -2,10 +2,10 @@
 
 At the range frequency f relative to the carrier f0, a beam with the Doppler centroid f_dc at the
 carrier has the centroid f_dc (1 + f / f0). The spectrum of a target is thus skewed: over the pulse
-bandwidth B its centroid moves by |f_dc| B / f0. Pulses sample it modulo the PRF. Where the Doppler
-band at each range frequency fits the PRF, it can be recovered: to each sample of the
-two-dimensional spectrum, that multiple of the PRF is added which brings it nearest to the centroid
-of its range frequency.
+bandwidth B its centroid moves by |f_dc| B / f0. Pulses sample it modulo the PRF. It can be
+recovered if the Doppler band at each range frequency is narrower than the PRF. A multiple of the
+PRF is added to the Doppler frequency of each sample of the two-dimensional spectrum, so that it
+comes nearest to the centroid of its range frequency.
 """
 
 from __future__ import annotations

@@ -103,7 +103,7 @@ def scene_grid(
         )
     steps = slope.diff(dim=0).norm(dim=-1)
     usual = float(steps[steps > 0].median())
-    if float(steps.max()) > 10 * usual:  # by choice, more than an uneven speed causes
+    if float(steps.max()) > 10 * usual:  # limit by choice, which an uneven speed does not exceed
         warnings.warn(
             f"the largest step between pulses, at pulse {int(steps.argmax())}, is {float(steps.max()) / usual:.3g} "
             "times the median one: pulses are missing there, which raises side lobes in azimuth",

@@ -1,13 +1,15 @@
 """Focusing of strips longer than memory, by overlapping azimuth blocks.
 
-A focused line is a convolution of raw lines with the azimuth filter. The filter occupies the time
-in which the line of sight crosses the processed Doppler band, and has tails beyond. Blocks overlap
-by this length and by a guard, so long that the tails beyond it, which are cut off, are below a
-level. Apart from these tails, the blocks equal one transform of the whole strip.
+A focused line is a convolution of raw lines with the azimuth filter. The main part of the filter
+has the length of the time in which the line of sight crosses the processed Doppler band; beyond it,
+the filter has tails. Blocks overlap by this length and by a guard. The guard is so long that the
+tails beyond it, which are cut off, are below a given level. Apart from these tails, the blocks
+equal one transform of the whole strip.
 
-The soft edges of a processed band (`band_hz`) make the tails short. A filter for the whole PRF
-jumps where the PRF band wraps. Its tails fall as 1 / g at g lines from the ends of the aperture,
-however long the blocks are: -35 dB at the seams takes a guard of 640 lines, -60 dB takes 203,000.
+The soft edges of a processed band (`band_hz`) make the tails short. A filter for the whole PRF has
+a discontinuity at the limits of the PRF band. Its tails therefore decrease only as 1 / g at g lines
+from the ends of the aperture, independently of the length of the blocks. For an error of -35 dB at
+the ends of the blocks, a guard of 640 lines is necessary; for -60 dB, 203,000 lines.
 """
 
 from __future__ import annotations

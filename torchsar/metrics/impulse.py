@@ -318,8 +318,10 @@ def _newton_step(jet: Tensor) -> Tensor:
     """Newton step (2, ...) towards a maximum of the squared magnitude.
 
     The step is at most half a grid step along each axis, and zero where the squared magnitude is
-    not concave. jet: real and imaginary part of the function and its derivatives, (..., 2, order
-    along the first axis, order along the second axis).
+    not concave.
+
+    jet: real and imaginary part of the function and its derivatives, (..., 2, order along the first
+    axis, order along the second axis).
     """
 
     value, slope = jet[..., :1, :1], torch.stack([jet[..., 1, 0], jet[..., 0, 1]], -1)

@@ -1,12 +1,12 @@
 """Estimation and correction of phase, gain and delay differences between channels.
 
-Stationary clutter is modelled as a Gaussian process. Its covariance over the channels without
-differences is known at every Doppler frequency: each Doppler band contributes with the response of
-the array to this band, and with the power that the antenna pattern gives the band. The differences
-are fitted to the data with this model by maximum likelihood. If the clutter fills fewer bands than
-there are channels, this amounts to fitting the balanced data into the subspace that the responses
-to these bands span (a noise-subspace method), and the power over Doppler is taken from the data.
-Otherwise the estimate relies on the expected power over Doppler.
+Stationary clutter is modelled as a Gaussian process. Its covariance over channels without
+differences is known at every Doppler frequency. Each Doppler band contributes the response of the
+array to this band, with the power that the antenna pattern gives the band. The differences are
+fitted to the data with this model by maximum likelihood. If the clutter fills fewer bands than
+there are channels, the power over Doppler is taken from the data. The balanced data are then fitted
+into the subspace of the responses to these bands (a noise-subspace method). Otherwise the estimate
+relies on the expected power over Doppler.
 
 Reference:
     Remote Sens. 2020, 12, 1703, section 4.3, which requires the correction without a method; Weiss
@@ -215,7 +215,7 @@ def estimate_balance(
         turn = torch.zeros(*data.shape[:-3], radar.channels, dtype=torch.float64, device=data.device)
         if position is not None and middle is not None:
             products = _products(lines, blocks, no_power)
-            coarse_db = 20.0  # by trial; from 20 dB on, delays hardly depend on it
+            coarse_db = 20.0  # found by trial; at 20 dB and more, the delays hardly depend on it
             by_block = model.weights(products.movedim(-3, 0), coarse_db)[0].movedim(0, -2)
             turn = _slope(by_block, middle, reference)
             products = _products(_turned(lines, turn, position), blocks, no_power)

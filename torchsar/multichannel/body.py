@@ -1,7 +1,7 @@
 """Velocity, image and echo of extended moving targets ("bodies").
 
 The slant-range velocity of a body is the one of highest likelihood over all tones and segments of
-its data, each with a free amplitude; at the end it is fitted to the tones of the pixels of the
+its data, each with a free amplitude. At the end it is fitted to the tones of the pixels of the
 body's image. The along-track velocity is the one of the sharpest image. The echo is the fit with
 both velocities.
 

@@ -3,9 +3,9 @@
 All scatterers of a body have one velocity. Range lines around the body are shifted by the range
 history of its middle and deramped channel by channel. Each scatterer then is one tone in all
 channels, even if aliased. The frequency F of the tone gives the along-track position y = y0 + F
-lambda R0 / v of the scatterer, with the position y0 and the closest range R0 of the middle and the
-along-track speed v of the receiver relative to the body. Position and velocity determine the phases
-of the tone across the channels.
+lambda R0 / v of the scatterer. Here y0 is the position and R0 the closest range of the middle, and
+v the along-track speed of the receiver relative to the body. Position and velocity determine the
+phases of the tone across the channels.
 
 In a short segment of slow time, the sea clutter at the frequency of a tone comes from only a few
 look angles, one for each Doppler band. Its covariance across the channels is estimated from range
@@ -219,7 +219,8 @@ class Chip:
             Echo, complex128 (line, channel, pulse), zero in pulses in which no part of the body is
             illuminated.
         """
-        # By trial. A lower level removes sea as well, a higher one leaves a part of the body.
+        # Threshold found by trial. A lower one would also remove parts of the sea; a higher one
+        # would not remove all of the body.
         clear = picture.amplitude * (picture.level > 2.0)
         spectrum = torch.zeros(len(clear), self.radar.channels, self.segments.n, dtype=clear.dtype, device=clear.device)
         spectrum[..., picture.index] = clear[:, None] * self.steering(self.motion, picture.tone_hz).mT

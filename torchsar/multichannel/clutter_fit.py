@@ -1,10 +1,10 @@
 """Gaussian model of stationary clutter seen by several channels, fitted by maximum likelihood.
 
 The unknowns are the logarithm and the phase of a weight of each channel, a delay of each channel,
-and the power of the noise. With weights exp(a + j p) that balance the channels, half the negative
-log-likelihood per look is 1/2 w^H Q w - sum(a), up to terms of the noise, where Q is the mean over
-the Doppler bins of the inverse model covariance times the conjugate measured covariance, element by
-element.
+and the power of the noise. With weights w = exp(a + j p) that balance the channels, half the
+negative log-likelihood per look is 1/2 w^H Q w - sum(a), up to terms of the noise. Here Q is the
+product, element by element, of the inverse model covariance and the conjugate measured covariance,
+averaged over the Doppler bins.
 
 Reference:
     Weiss and Friedlander 1990 (self-calibration of gains and phases in subspace form).

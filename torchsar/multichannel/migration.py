@@ -3,10 +3,10 @@
 A keystone transform removes the range walk of all targets at once, but it needs unaliased slow
 time, and each channel is aliased. The range history of a reference point is therefore removed first
 from carrier and envelope, which reduces each target to a tone. The factor is exp(+j 2 pi (fc + fr)
-/ c (R_ref,m(t) - R_ref)), with the carrier frequency fc, the range frequency fr, the range
-R_ref,m(t) between the reference point and channel m, and its closest range R_ref. Slow time is then
-rescaled, t -> t fc / (fc + fr), and the history is restored in the carrier alone. Azimuth phases
-are unchanged, and the envelope of each target stays at one range.
+/ c (R_ref,m(t) - R_ref)), with the carrier frequency fc and the range frequency fr. R_ref,m(t) is
+the range between the reference point and channel m, and R_ref is its closest range. Slow time is
+then rescaled, t -> t fc / (fc + fr), and the history is restored in the carrier alone. Azimuth
+phases are unchanged, and the envelope of each target is at the same range in all pulses.
 
 Reference:
     Remote Sens. 2020, 12, 1703, section 4.1, which names the keystone transform without the deramp

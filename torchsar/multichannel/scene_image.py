@@ -1,10 +1,10 @@
 """Image of a stationary scene and of its moving targets at their true positions.
 
-The conventional image is formed and targets are detected in it. Then for each target, strongest
-first, the range lines around it are extracted, its velocity is estimated, its echo is removed from
-the data, and it is imaged with its own velocity at its true position. Removal of the echo also
-removes the false targets that it causes, so that these are not detected as targets. Weaker targets
-are then sought in an image in which the sea is suppressed.
+The conventional image is formed and targets are detected in it. The targets are then processed one
+after the other, the strongest first. The range lines around a target are extracted and its velocity
+is estimated. Its echo is removed from the data, and it is imaged with its own velocity at its true
+position. Removal of the echo also removes the false targets that it causes, so that these are not
+detected as targets. Weaker targets are then sought in an image in which the sea is suppressed.
 
 Reference:
     Remote Sens. 2020, 12, 1703, Fig. 13 and section 4.3.
@@ -271,7 +271,9 @@ class ImageMovers(Stage):
         return remaining, bodies
 
     def _inside_frame(self, detection: Detection, signal: Signal) -> bool:
-        """Test if a target stays in the swath at any velocity and is broadside in the record."""
+        """Test if a target remains in the swath at any velocity and is broadside within
+        the record.
+        """
         axis, pulse = signal.axis("range"), signal.axis("pulse")
         abeam_s = detection.azimuth_m / self.radar.speed_m_s
         walk = self.extraction.range_m + self.radar.ambiguous_velocity_m_s / 2 * (

@@ -1,7 +1,7 @@
 """Conventional imaging of the stationary scene from all channels over the whole swath.
 
-The transmit range has been removed from the data, so that only the receive path remains. For a
-stationary point, the data of the channel at the along-track position dx_m are then those of a
+The transmit range has been removed from the data, so that only the receive path remains. Consider
+the channel at the along-track position dx_m. For a stationary point, its data are those of a
 channel at position 0, delayed by dx_m / V_R in slow time, where V_R is the speed of the receiver.
 This holds exactly, at every range frequency. The full Doppler band can therefore be reconstructed
 with zero target velocity before any migration is corrected.

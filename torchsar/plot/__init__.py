@@ -1,8 +1,8 @@
 """Figures of images, curves and parameter sweeps; the only package that imports matplotlib.
 
 Each function that draws takes signals or arrays and returns a matplotlib Figure, or a list of
-Figures, one for each panel, so that a page can set the panels side by side or below each other.
-`save` writes a Figure or such a list into one file, and notebooks show both as pictures.
+Figures with one for each panel. A page can therefore set the panels side by side or below each
+other. `save` writes a Figure or such a list into one file, and notebooks show both as pictures.
 """
 
 try:

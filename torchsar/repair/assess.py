@@ -89,8 +89,8 @@ def assess_imbalance(
     # the standard deviations of that level, or 3 % of the power where the level is not known.
     bias = torch.where(share > 0, 3 / math.sqrt(looks[1]) * share / (1 - share), 0.03)
     gain_std = root(gain_std.square() + (gain * torch.log(gain) * bias).square())
-    # By choice: a phase that is uncertain by 0.25 rad is that of noise. Where the noise is not
-    # known, the coherence must exceed 0.2.
+    # Limits by choice: a phase with a standard deviation above 0.25 rad may be that of noise. If
+    # the noise is not known, the coherence must exceed 0.2.
     chance = (coherence < 5 / math.sqrt(looks[0])) | (phase_std > 0.25).any(-1)
     known = (share > 0).all(-1) | (coherence > 0.2)
     inexact = (phase_std > _MOST_IMBALANCE) | (gain_std > _MOST_IMBALANCE * gain)

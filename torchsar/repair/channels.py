@@ -1,10 +1,11 @@
 """Gain and phase imbalance of channels that record the lines in turn.
 
 Channel c of C channels records the lines i with i mod C = c and multiplies them by g_c exp(j
-phi_c). The product of a line with the conjugate of the line before, averaged over a recording, has
-the phase phi_c - phi_(c-1) + rho, where rho is the phase increment from line to line that belongs
-to the Doppler centroid. In the sum over all channels the phi cancel, so that the C products give
-rho and every phi_c - phi_0. Gains follow from the powers of the lines.
+phi_c). Each line is multiplied by the conjugate of the line before, and the products of a channel
+are averaged over a recording. The mean has the phase phi_c - phi_(c-1) + rho, where rho is the
+phase increment from line to line due to the Doppler centroid. In the sum over all channels the phi
+cancel, so that the C products give rho and every phi_c - phi_0. Gains follow from the powers of the
+lines.
 """
 
 from __future__ import annotations

@@ -22,8 +22,9 @@ from torch.nn.functional import pad
 
 from torchsar.core import checked_samples, host_value, power_of, unit_level
 
-# Power in units of the mean level from which a cell may hold interference. Speckle is exponential:
-# exp(-30) leaves one false cell in 1e13. The clean RADARSAT-1 blocks stay below 24.
+# Power in units of the mean level above which a cell may contain interference. The power of speckle
+# is exponential, so that exp(-30) gives one false cell in 1e13. In the clean RADARSAT-1 blocks, all
+# cells are below 24.
 THRESHOLD = 30.0
 # Least median over mean power of the blocks of a line with which its energy counts as lasting. It
 # is 1 for a tone, 0.7 for noise-like interference, and near 0 for chirps that sweep through the

@@ -7,11 +7,11 @@ the missing lines alone, solved by conjugate gradients. Then v is estimated agai
 reconstructed image, and the system is solved again. The first estimate (`bright_fill`) keeps only
 the bright part of the image; it finds points but no texture.
 
-The model is better on recorded data for three reasons. A local power estimate follows texture,
-which a threshold does not. Conjugate gradients converge faster than plain iteration. As v differs
-between sub-looks, the model accounts for properties of the azimuth spectrum such as band edges,
-noise floor, drift of the Doppler centroid over the scene, and apertures cut by the ends of the
-recording.
+The model is better on recorded data than a threshold (`bright_fill`) for three reasons. A local
+power estimate follows texture, which a threshold does not. Conjugate gradients converge faster than
+plain iteration. The power v differs between sub-looks, and the model thus describes band edges,
+noise floor and drift of the Doppler centroid over the scene. It also describes apertures cut by the
+ends of the recording.
 """
 
 from __future__ import annotations
@@ -230,7 +230,7 @@ class IncompleteLines:
 
 
 def _spaced(like: Tensor, shape: tuple[int, ...]) -> Tensor:
-    """Empty array whose rows lie an odd number of cache lines apart.
+    """Empty array whose rows begin at distances of an odd number of cache lines.
 
     If the distance were a power of two, the samples of a column would share a few places in the
     cache.

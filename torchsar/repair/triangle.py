@@ -8,11 +8,11 @@ Their time grid, `TriangularLadar.fast_time_axis`, is symmetric about the middle
 the range beat frequency f+ and the Doppler shift fd, up sweeps have the beat frequency fd + f+ and
 down sweeps fd - f+.
 
-The first sample of a sweep lies half a sampling interval after the trigger. Where the record has no
+The first sample of a sweep lies half a sampling interval after the trigger. If the record has no
 sample there, the whole record is delayed by a fraction of a sample (linear phase of its spectrum).
-The time grid of the sweeps is never shifted instead: if the grid is off by dt, velocities that are
-estimated from the product of the up sweep and the mirrored down sweep are biased by
-0.76 f+ dt lambda / T. A record with a sample exactly at the trigger must be delayed as well.
+A record with a sample exactly at the trigger must be delayed as well. Shifting the time grid of the
+sweeps instead would be wrong. Velocities that are estimated from the product of the up sweep and
+the mirrored down sweep would be biased by 0.76 f+ dt lambda / T for a shift by dt.
 
 A detector with one real channel does not give the sign of a beat frequency. Its analytic signal has
 the beat frequency f+ + fd in the up sweep and f+ - fd in the down sweep; the conjugate of the down

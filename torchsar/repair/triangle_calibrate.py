@@ -1,17 +1,17 @@
 """Correction of non-linear sweeps of a triangular ladar by its internal calibration channel.
 
 At the time u from the middle of a sweep, the optical frequency of the transmitter is fc +- K u +
-e'(u): + in the up sweep, - in the down sweep, with the carrier fc, the chirp rate K, and the
-derivative e' of a phase error e(u) in turns, which differs between up and down. The calibration
-channel mixes the transmitted signal with itself delayed by tc:
+e'(u), with the carrier fc and the chirp rate K. The sign is + in the up sweep and - in the down
+sweep. The phase error e(u) in cycles differs between both, and e' is its derivative. The
+calibration channel mixes the transmitted signal with itself delayed by tc:
 
     channel phase / 2 pi = fc tc +- K u tc + e(u) - e(u - tc) + constant.
 
 Let w(u) = u +- e'(u) / K be the time at which a linear sweep has the frequency of the real one.
-Since e(u) - e(u - t) = t e'(u - t / 2) except for t^3 e''' / 24, the channel gives w - u at the
-time u - tc / 2, and the beat of ANY range is a pure tone as a function of w. A constant part of e'
-is a change of the carrier, which the channel cannot determine; the mean of w - u over the sweep is
-therefore set to zero.
+Except for t^3 e''' / 24, e(u) - e(u - t) = t e'(u - t / 2). The channel therefore gives w - u at
+the time u - tc / 2, and the beat of ANY range is a pure tone as a function of w. A constant part of
+e' is a change of the carrier, which the channel cannot determine; the mean of w - u over the sweep
+is therefore set to zero.
 
 Reference:
     Remote Sens. 2024, 16, 793, section 2.1 (internal calibration module).

@@ -19,10 +19,10 @@ turns as well. The estimate is made in four steps:
    the sweeps give the same phases as -v and the other order. The correct order is then the one for
    which the range from the beat frequencies changes in the same sense as the integrated velocity.
 
-Measured errors: in complex records with RD = 1.5 m, 24 periods and a sampling interval of 16 ns,
-0.02 ns without noise, 0.2 ns at 10 dB and 0.6 ns at 0 dB; in real records of the ground experiment
-of the Reference with 64 periods, 0.01 to 0.04 ns at 10 dB. A record of 960 blocks of 9600 real
-samples takes 6 s and 1.2 GB on one core.
+Measured errors in complex records with RD = 1.5 m, 24 periods and a sampling interval of 16 ns are
+0.02 ns without noise, 0.2 ns at 10 dB and 0.6 ns at 0 dB. In real records of the ground experiment
+of the Reference with 64 periods, they are 0.01 to 0.04 ns at 10 dB. A record of 960 blocks of 9600
+real samples takes 6 s and 1.2 GB on one core.
 
 Reference:
     Remote Sens. 2024, 16, 793, Fig. 15 (separation by short-time Fourier transform).

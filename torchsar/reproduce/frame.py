@@ -94,7 +94,7 @@ def _frame(small: bool, off_m_s: float = 2.0, width: int = 1024) -> _Frame:
     log.info("frame: modulus")
     amplitude = Detect()(image)
     spent = time.process_time() - began[0], time.perf_counter() - began[1]
-    import resource  # this module does not exist on all operating systems
+    import resource  # the module is not available on all operating systems
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
     off = float(speed) - SENSOR.velocity_m_s - off_m_s

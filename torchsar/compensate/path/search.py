@@ -139,8 +139,8 @@ class Search:
         imaging: Image formation of the scene.
         """
         columns = moved(self.rows, self.frequency_hz, range_m).mT[None].contiguous()
-        # By trial. With more iterations the phases drift away, because errors across the line of
-        # sight are not known yet.
+        # The 10 iterations were chosen by trial. With more of them, the phases diverge, because
+        # errors across the line of sight are not known yet.
         run = Run(Wiener(), Through(imaging), 10, 1.0, 1e-3)
         phase, _ = fixed_point(columns, torch.zeros_like(columns[:, 0].real), run)
         return line_free(range_m + self.metres(phase[0]), self.present)

@@ -75,11 +75,15 @@ def displacement(spectrum: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
 def _four_displacements(
     one: Tensor, other: Tensor, whole: Tensor, present: Tensor, near: Tensor | None = None
 ) -> tuple[list[Tensor], Tensor]:
-    """Displacements by both halves of the band, and by the nearer and the farther range cells of
-    the whole band, (trial, pulse) each, float64; and which are the nearer cells, (trial, cell).
+    """Displacements of the pulses by four parts of the data, (trial, pulse) each, float64.
 
-    one, other, whole: powers, (trial, pulse, cell). The nearer cells have half of the sum of the
-    squared slopes of the mean profile, and so half of the information about displacements.
+    The parts are both halves of the band, and the nearer and the farther range cells of the whole
+    band. Also returns True for the nearer cells, (trial, cell).
+
+    The nearer cells have half of the sum of the squared slopes of the mean profile, and therefore
+    half of the information about displacements.
+
+    one, other, whole: powers by both halves and by the whole band, (trial, pulse, cell).
     """
     profiles = [_profiles(power) for power in (one, other, whole)]
     if near is None:

@@ -102,8 +102,8 @@ def conclude(
         # 2.4 in 90 % of the trials in which a vehicle as strong as 30 points moves independently.
         (Outcome.PARTS_DISAGREE, gain > 2.2),
         (Outcome.HOMOGENEOUS, homogeneous > 0),
-        # If a gap is longer than this share of the record, many points do not determine the phase
-        # between the pulses before and after it.
+        # If a gap exceeds this fraction of the record, the phase between the pulses before and
+        # after it cannot be determined in a scene of many points.
         (Outcome.TOO_FEW, (unsteady > 0) | (gap > 0.36)),
         (Outcome.DISPLACED, (jitter >= LARGEST_JITTER) | (migration >= LARGEST_MIGRATION)),
         # the prediction of the sharpness of noise is correct within 15 %

@@ -275,8 +275,8 @@ def have_gaps(present: Tensor) -> Tensor:
     Returns:
         True where they do, shape (trial,).
     """
-    # With 0.07, which a gap of a sixteenth of the record does not reach, errors of 40 points were a
-    # sixth larger.
+    # The limit is exceeded if a gap is a sixteenth of the record. With the limit 0.07 this was not
+    # so, and the phase errors of 40 points were larger by a sixth.
     return side_lobes(present) > 0.06
 
 

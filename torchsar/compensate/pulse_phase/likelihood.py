@@ -1,8 +1,8 @@
 """Likelihood of the phases of the pulses of a homogeneous scene.
 
-The samples z of a range cell over the pulses are z = D a, where D = diag(exp(j phi)) holds the
-phase errors and a is circular Gaussian with a Toeplitz covariance R that the Doppler spectrum
-fixes. The negative log likelihood of a cell is
+The samples z of a range cell over the pulses are z = D a, where the diagonal matrix D = diag(exp(j
+phi)) contains the phase errors. The vector a is circular Gaussian with a Toeplitz covariance R,
+which the Doppler spectrum determines. The negative log likelihood of a cell is
 
     ln det R + tr(R^-1 D^H C D) = ln det R + u^H (R^-T o C) u,    u = exp(j phi),
 

@@ -421,7 +421,8 @@ class View:
         k = torch.arange(g.shape[-1], dtype=torch.float64, device=g.device)
         low, top, high = (
             power_of(self.image.gather(-1, torch.remainder(self.peak[..., None] + d, padded)))[..., 0]
-            .clamp_min(torch.finfo(self.power.dtype).tiny)  # where the derivative of the root is finite
+            # not zero, since the derivative of the root is infinite there
+            .clamp_min(torch.finfo(self.power.dtype).tiny)
             .sqrt()
             for d in (-1, 0, 1)
         )

@@ -43,8 +43,9 @@ def phases_of_points(rows: Tensor, present: Tensor, phase_rad: Tensor) -> tuple[
         per trial that is True where they do.
     """
     energy = power_of(rows.detach()).sum(-1)
-    # With energy in more than 16 effective range cells, noise is as strong as the points, or there
-    # are many points. With fewer than 32 pulses, lines also explain echoes that are no points.
+    # The fit of points is not used if more than 16 effective range cells have energy: the noise is
+    # then as strong as the points, or there are many points. It is not used with fewer than 32
+    # pulses either, since the fit also explains echoes that are not points.
     open_ = (energy.sum(-1).square() < 16 * energy.square().sum(-1)) & (present.sum(-1) >= 32)
     phase, explained = phase_rad, torch.zeros_like(open_)
     at = true_positions(open_, host_value(open_.sum(), len(open_)))

@@ -207,7 +207,7 @@ def bulk_shift(blocks: Tensor, pulses: int) -> tuple[Tensor, Tensor]:
     n = blocks.shape[-1]
     blocks = torch.stack([blocks[..., 0, :, :], blocks[..., 1, :, :].roll(-1, -1).flip(-1)], -3)
     likeness, lag = _best_lag(torch.fft.fftshift(blocks, dim=-1), 2 * n)
-    alike = likeness > 0.35  # by trial; the likeness of noise alone does not reach it
+    alike = likeness > 0.35  # limit found by trial, which pure noise does not reach
     lag = filled(_median_of_three(filled(lag.to(torch.float64), alike)), alike)
     shift = torch.round(_through_blocks(lag, pulses) / 2).to(torch.int64)
     return shift, alike.repeat_interleave(_BLOCK, -1)[..., :pulses]
@@ -303,10 +303,11 @@ class Spectra:
             The spectra.
         """
         middle = sweeps.shape[-1] // 2
-        # with a power of two as scale, squares neither underflow nor overflow
+        # the scale is a power of two, with which squares neither underflow nor overflow
         scale = 1 / level_of(sweeps.detach()[..., middle - 4 : middle + 4], 3)
         spectrum = torch.fft.fft(sweeps.conj() if radar.dechirp_sign == "echo_conj_lo" else sweeps)
-        # with a rectangular window, a peak between two bins would lose more than half of its power
+        # a Hann window, because with a rectangular one a peak between two bins would lose more than
+        # half of its power
         whole = spectrum.detach()
         between = torch.cat([whole[..., -1:], whole, whole[..., :1]], -1)
         smooth = torch.sub(whole, between[..., :-2] + between[..., 2:], alpha=0.5).mul_(scale)
@@ -392,8 +393,9 @@ def _corrected_shift(smooth: Tensor, shift: Tensor, first: int, lines: int) -> t
     """
     power = power_of(_in_window(smooth, shift, first, lines))
     likeness, lag = _best_lag(power, 2 ** math.ceil(math.log2(2 * lines)))
-    # By trial. Envelopes this similar overrule those of the neighbouring periods. A lag beyond 14
-    # bins is the distance to another scatterer, illuminated in one sweep only.
+    # Limits found by trial. Envelopes that are this similar are used even if the neighbouring
+    # periods have another lag. A lag beyond 14 bins is the distance to another scatterer, which was
+    # illuminated in one sweep only.
     certain = (likeness > 0.7) & (lag.abs() <= 14)
     own = shift + torch.where(certain & (lag.abs() >= 2), torch.round(lag / 2).to(torch.int64), 0)
     typical = _median_of_three(own)

@@ -317,7 +317,8 @@ def smooth_walk(rows: Tensor) -> Tensor:
         return (cells * raised.log().sum(-1)).sum(0) + amplitude.square().sum(-1) / 2
 
     amplitude = torch.zeros(len(rows), len(order), dtype=real, device=rows.device)
-    for floor in (1e-1, 1e-2, 1e-3, 1e-4):  # with a high floor the descent passes over local minima
+    # the first descents have a high floor and therefore pass over local minima
+    for floor in (1e-1, 1e-2, 1e-3, 1e-4):
         amplitude = adam(lambda x, floor=floor: cost(x, floor), amplitude, steps=40, rate=0.15).x
     return (amplitude @ walks).to(torch.float64)
 

@@ -125,7 +125,7 @@ def segmented_interference(
     def measure(spectra: Spectra) -> Measured:
         bands = spectra.bands(video=bins == "peak")
         windowed = spectra.bands(window_m, taper=0.0)
-        # with "sum", the upsampling is that of section 3.3.2 of the paper
+        # "sum" uses the upsampling factor of section 3.3.2 of the paper
         coarse = envelope_lag(windowed, 20 if bins == "sum" else 4) / 2 + (windowed.shift - bands.shift)
         moved = bands
         if bins == "sum":  # bands without the Doppler shift that the envelopes show

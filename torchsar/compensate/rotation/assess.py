@@ -35,7 +35,8 @@ from torchsar.metrics import entropy
 # largest phase error, in rad rms, of a scatterer at the edge of the target: it then still has a
 # Strehl ratio of 0.8, the convention of Marechal
 MOST_PHASE_ERROR_RAD = math.sqrt(-math.log(0.8))
-_LEAST_SCATTERERS = 3  # with fewer scatterers the rotation is not determined reliably, a convention
+# least number of scatterers from which the rotation is determined reliably, by convention
+_LEAST_SCATTERERS = 3
 _CLEAR = 1.3  # factor over the detection threshold: noise alone exceeds it in one of 1000 images
 
 
@@ -159,7 +160,7 @@ def _questioned(
     count, order = found.used.sum(-1), judged.k.shape[-1]
     lag = found.pull.shape[-1] // 5  # number of samples of a history with correlated errors
     # With few scatterers, the scatter between them underestimates the variance. The scatter of the
-    # samples within each history is added.
+    # samples within each history is therefore added.
     own = lag * torch.einsum("bpij,bpkj->bik", found.pull, found.pull)
     pull = found.pull.sum(-1)
     free = count / (count - found.inverse.shape[-1]).clamp_min(0.1)  # degrees of freedom of the fit

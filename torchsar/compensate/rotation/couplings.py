@@ -60,8 +60,8 @@ class Neighbours:
             are left out of `shape`.
         """
         used, n = amplitude != 0, cell.shape[1]
-        # pairs that are 5 cells farther apart may come near in later steps: in each of seven steps
-        # a scatterer moves by at most 0.3 cells
+        # Pairs up to 5 cells farther apart are included, because they may come closer in later
+        # steps. In each of seven steps a scatterer moves by at most 0.3 cells.
         near = (cell[:, :, None] - cell[:, None]).abs() < _NEAR_CELLS + 5
         near = (near & used[:, :, None] & used[:, None]).flatten()
         number = torch.arange(1, n + 1, device=cell.device)

@@ -1,8 +1,8 @@
 """Unknowns of a rotation, and the entropy of the image as their function, for many candidates.
 
-For each candidate rotation, the phase that depends on the range of a scatterer is removed (if the
-settings say so), the image is formed by the matched Fourier transform
-(`torchsar.focus.matched_fourier`), and the entropy of the image is computed.
+For each candidate rotation, an image is formed by the matched Fourier transform
+(`torchsar.focus.matched_fourier`), and its entropy is computed. If the settings say so, the phase
+that depends on the range of a scatterer is removed before.
 """
 
 from __future__ import annotations

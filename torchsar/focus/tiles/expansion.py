@@ -1,8 +1,8 @@
 """Path lengths about the centres of tiles: exact slopes, and the parts that a tile approximates.
 
-A pixel lies at (x, y) from the centre of its tile along the axes of the image. For pulse p, l_p is
-the path from the transmitter over the pixel to the receiver, a and b are its derivatives along x
-and y at the centre. With a reference place in the middle of the sub-aperture (index 0),
+A pixel is at (x, y) from the centre of its tile along the axes of the image. For pulse p, l_p is
+the path from the transmitter over the pixel to the receiver; a and b are its derivatives along x
+and y at the centre. The index 0 denotes a reference place in the middle of the sub-aperture. With
 
     eps = b / b_0 - 1,    s = a / (1 + eps) - a_0,
 
@@ -11,10 +11,11 @@ the wave number k = k_c / (1 + eps) + q of pulse p has the phase
     k (l_p(x, y) - l_p(0, 0)) = k_c (l_0(x, y) - l_0(0, 0)) + (k_c + q) x s
                                 + q (a_0 x + b_0 y) + small terms in x, y, q and s,
 
-in which the pulse enters through s alone. The small terms are polynomials of second order in x and
-y, whose coefficients are fitted as polynomials of s: second derivatives of the path, divided by 1 +
-eps, and eps itself. Those common to all tiles are exact functions of s and x; those of a single
-tile, and all that multiply y, are expanded to second order (`remainders`).
+which depends on the pulse only through s. The small terms are polynomials of second order in x and
+y. They consist of second derivatives of the path, divided by 1 + eps, and of eps itself; their
+coefficients are fitted as polynomials of s. Terms that are common to all tiles are exact functions
+of s and x. Those of a single tile, and all that multiply y, are expanded to second order
+(`remainders`).
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """Geometry of an image by tiles, and the errors of tiles from a sample of zones and pulses.
 
-The numbers of samples are chosen so that more of them change the predicted error by 1 dB at most;
-24 pulses of a sub-aperture and 33 values of eps and of the frequency were enough in 11 and in 14
-geometries. Errors change slowly from zone to zone, but those of one sub-aperture of a rough path
-were found 13 dB above those of 15 others. A zone is so small that its tiles sum about a quarter
-more pulses than light a pixel, and the lit part of an image is found if it is wider than a 64th.
+The numbers of samples are chosen so that more of them change the predicted error by 1 dB at most:
+24 pulses of a sub-aperture, and 33 values of eps and of the frequency. Errors change slowly from
+zone to zone, but those of one sub-aperture of a rough path were 13 dB above those of 15 others. The
+tiles of a zone sum about a quarter more pulses than illuminate a pixel. The illuminated part of an
+image is found if it is wider than a 64th of the image.
 """
 
 from __future__ import annotations

@@ -114,7 +114,7 @@ class Sector:
             grid = grid.transposed()
             scene = replace(scene, grid=grid)
         self._scene = scene
-        # the tables of the choice are on the host, whatever the default device is
+        # the tables of the choice are on the host, independently of the default device
         with torch.device("cpu"):
             self.choice = choice = choose(scene, self.error_db)
         self._size = size = choice.width, choice.depth

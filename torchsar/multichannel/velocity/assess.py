@@ -66,7 +66,7 @@ def outcome_of_point(
         `reasons`. With `inside`, also `pulse_rates` of shape (...,): the number of PRFs to add to
         the Doppler, -1, 0 or 1, and 0 where nothing is found.
     """
-    # for zeros, the ratio is -300 dB
+    # the ratio is set to -300 dB for samples of zero
     empty, weak = found.snr_db < -250.0, found.snr_db < DETECTED_DB
     codes = [
         (Outcome.EMPTY, empty),

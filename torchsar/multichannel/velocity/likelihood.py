@@ -323,7 +323,7 @@ def fitted_together(
     time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
     weight = aperture.weight(radar, start, time_s)[..., None, :]
     fit_at = partial(_fit_of_points, data, radar, weight, time_s, unknowns)
-    # by trial, points that differ by 10 dB converge in 8 steps
+    # 8 steps suffice for points whose powers differ by 10 dB, by trial
     motion, fit = _climbed(data, fit_at, start, unknowns, 8)
     echoes = fit.amplitude[..., None, None] * weight * point_phasor(radar, motion, time_s, torch.complex128)
     left = data - echoes.sum(-3)

@@ -200,8 +200,9 @@ class _Job:
             tried = tried & (share > 0.02)
             if not bool(tried.any()):
                 break
-            # By choice, this is a point rather than clutter. It also exceeds the 0.001 of the
-            # energy of the first point that the model of the echo of a wide chirp does not explain.
+            # By choice, such a maximum is a point rather than clutter. The second limit exceeds the
+            # 0.001 of the energy of the first point that the echo model of a wide chirp does not
+            # explain.
             clear = (share > 0.05) & (further.energy > 0.002 * found.energy)
             disturbed = disturbed | (tried & clear & self._overlap(found.motion, further.motion))
             points = points.each(lambda these, one: torch.cat([these, one[..., None]], -1), further.motion)

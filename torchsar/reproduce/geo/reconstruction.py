@@ -1,10 +1,11 @@
 """Reconstruction of the Doppler band of moving points from few channels: figures 10 to 12 and 17 of
 Remote Sens. 2020, 12, 1703.
 
-Azimuth only, without noise. "Band-limited": the target is seen for 4.5 s; "pattern": through the
-pattern of the elements, in records of 20 s, so that replicas up to three pulse rates away have
-their own positions. MFTA: largest false target against the peak. N: Doppler bands that are
-reconstructed. Nothing here is random.
+The data are azimuth-only and without noise. "Band-limited" means that the target is seen for 4.5 s.
+"Pattern" means that it is seen through the pattern of the elements, in records of 20 s, so that
+replicas up to three pulse rates away have their own positions. MFTA is the amplitude of the largest
+false target relative to the peak. N is the number of Doppler bands that are reconstructed. No
+number here is random.
 """
 
 from __future__ import annotations

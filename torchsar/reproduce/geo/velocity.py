@@ -1,12 +1,13 @@
 """Slant-range velocity of moving targets from three channels: Tables 2 and 3 of Remote Sens. 2020,
 12, 1703.
 
-The signal intensity ratio (SIR) is the paper's estimator. It searches 4 to 16 m/s in Table 2, whose
-largest published error is 5.68 m/s of 10 m/s, and all unambiguous velocities in Table 3;
-"recommended" finds u_r, u_a within +-5 m/s and the position at once. White noise, a target seen for
-4.5 s. SCNR is read as that of a raw sample, which range compression improves by 10 lg(B tau) =
-27 dB. Errors are means of |error| over trials, bounds are Cramer-Rao standard deviations times
-sqrt(2 / pi), the mean |error| of a Gaussian. Published errors are of a single trial each.
+The signal intensity ratio (SIR) is the paper's estimator. In Table 2, whose largest published error
+is 5.68 m/s of 10 m/s, it searches 4 to 16 m/s; in Table 3 it searches all unambiguous velocities.
+The estimator "recommended" finds u_r and u_a within +-5 m/s, and the position, at once. There is
+white noise, and a target is seen for 4.5 s. SCNR is understood as that of a raw sample, which range
+compression improves by 10 lg(B tau) = 27 dB. Errors are means of |error| over trials. Bounds are
+Cramer-Rao standard deviations times sqrt(2 / pi), the mean |error| of a Gaussian. Published errors
+are of a single trial each.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
 """Three points of a target with non-uniform rotation: figures 1 to 3 of Remote Sens. 2025, 17,
 3447.
 
-Profiles of points at -12, 0 and 12 m of cross range, 12 m behind the centre of rotation, by what is
-taken out of the echo; and what a range centre deviation does to the estimated rate where it is
-ignored: of one range cell, as the paper has it, and of a whole image.
+The three points have cross ranges of -12, 0 and 12 m and are 12 m behind the centre of rotation.
+Their profiles are shown for several parts of the phase that are removed from the echo. The module
+also computes the error of the estimated rotation rate if a deviation of the range centre is
+ignored. This is done for one range cell, as in the paper, and for a whole image.
 """
 
 from __future__ import annotations

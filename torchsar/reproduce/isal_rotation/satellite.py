@@ -1,12 +1,13 @@
 """A satellite with non-uniform rotation: figures 4 to 12 and Tables 1 and 2 of Remote Sens. 2025,
 17, 3447, with a procedural satellite in place of the one that is not published.
 
-The image without compensation, as a sum of chirplets (ACL), with the acceleration alone taken out
-((SM), and with the recommended estimate of the whole rotation; the positions of both panel tips in
-the image that is scaled to metres; and Newton's method, which the paper calls Gauss-Newton, from
-0.9, 1 and 1.1 times the truth, on images of 8 lines per Doppler cell. With fewer lines the least
-entropy lies farther from the truth (see `EntropyObjective`). Numbers are means over scenes, each
-with noise of its own; pictures show the first scene.
+The module computes four images: without compensation, as a sum of chirplets (ACL), with only the
+acceleration removed (SM), and with the recommended estimate of the whole rotation. It computes the
+positions of both panel tips in the image that is scaled to metres. It also applies Newton's method,
+which the paper calls Gauss-Newton, to images of 8 lines per Doppler cell, beginning at 0.9, 1 and
+1.1 times the truth. With fewer lines the least entropy lies farther from the truth (see
+`EntropyObjective`). Numbers are means over scenes, each with noise of its own; pictures show the
+first scene.
 """
 
 from __future__ import annotations

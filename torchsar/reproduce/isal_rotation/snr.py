@@ -1,14 +1,16 @@
 """Uneven rotation by signal-to-noise ratio: figures 13 to 17 and Tables 3 and 4 of Remote Sens.
 2025, 17, 3447.
 
-Monte Carlo on a small satellite (60 scatterers), a new scene and new noise in every trial: the
-recommended estimator, which gets the data alone, the genetic algorithm (GA) in a box of +-10 %
-about the truth with images of one and of four lines per Doppler cell, and the Cramer-Rao bound.
-Then the full satellite: its images, and the error of the cross range of its tip, which is that of
-the rate. The genetic algorithm has a population of 10 per unknown and forms 170 images, for the
-published run time of 1202 s at 7.4 s per image allows 162. Every trial of it has random numbers of
-its own. Published errors stand beside them. SNR: mean power of all samples over the variance of
-the noise.
+Trials use a small satellite (60 scatterers), with a new scene and new noise in every trial. The
+recommended estimator, which uses only the data, is compared with a genetic algorithm (GA) and with
+the Cramer-Rao bound. The GA searches within +-10 % about the truth on images of one and of four
+lines per Doppler cell. For the full satellite, the module computes images, and the error of the
+cross range of its tip, which has the relative error of the rate.
+
+The genetic algorithm has a population of 10 per unknown and forms 170 images, because the published
+run time of 1202 s at 7.4 s per image allows 162. Every trial has its own random numbers. Results
+are shown together with the published errors. The SNR is the mean power of all samples over the
+variance of the noise.
 """
 
 from __future__ import annotations

@@ -2,9 +2,10 @@
 Remote Sens. 2024, 16, 793.
 
 Entropies and contrasts depend on the size of the image and on the noise, which the paper does not
-give: their order is compared. With points of equal phase on a regular grid a wrong image has less
-entropy than the true one, so that the phases are random here; methods are judged by the residual
-phase as well: 4 pi / lambda times the rms range error, without constant and slope.
+give; only their order is therefore compared. The phases of the points are random. With points of
+equal phase on a regular grid, a wrong image would have less entropy than the true one. Methods are
+also judged by the residual phase: 4 pi / lambda times the rms range error, without constant and
+slope.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ from torchsar.study.settings.errors import ConfigError
 # longer descriptions of values are replaced by a digest
 _SHOWN = 40
 _PLAIN = (type(None), bool, int, float, complex, str, bytes, type(Ellipsis))
-# of these objects, only those members are described that the code names
+# kinds of objects of which only the members that the code names are described
 _NAMESPACES = (ModuleType, argparse.Namespace, SimpleNamespace)
 
 

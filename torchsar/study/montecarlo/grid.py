@@ -18,7 +18,8 @@ from torchsar.study.settings.text import fault_of_name
 
 # names that dimensions and parts of results already have
 RESERVED = ("algorithm", "trial", "method", "ok", "outcome", "done", "saved")
-# in bytes; file systems allow 255, and names of bounds and figures are longer than those of metrics
+# Largest length of a name in bytes; file systems allow 255. The margin is needed because names of
+# bounds and figures are longer than those of metrics.
 _LONGEST = 200
 
 

@@ -4,9 +4,10 @@ One process writes, every file of a zarr store is replaced as a whole, and the m
 last. If a sweep is killed, its arrays may therefore hold more trials than are marked as done, but
 never fewer. Trials that are not marked are ignored and computed again.
 
-Everything that is read has a checksum: each chunk has that of zarr, and the marks hold those of the
-numbers of each point, so that a missing or an earlier chunk is found as well, of the saved arrays,
-of the metadata of all arrays, and of the attributes themselves.
+Everything that is read has a checksum. Each chunk has the checksum of zarr. The marks of the trials
+contain those of the numbers of each point, so that a missing or an older chunk is detected. They
+also contain the checksums of the saved arrays, of the metadata of all arrays, and of the
+attributes.
 """
 
 from __future__ import annotations
