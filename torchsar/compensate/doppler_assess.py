@@ -237,8 +237,9 @@ def of_point(
     rows = torch.minimum(off, n - off) <= 4 * cell[0][..., None]  # the image is circular in azimuth
     columns = (torch.arange(power.shape[-1], device=power.device) - sample[..., None]).abs() <= 4 * cell[1]
     rival = power.masked_fill(rows[..., :, None] & columns[..., None, :], 0).amax((-2, -1)).double()
-    # The peak is the highest of many samples with noise of the whole PRF. The sum of the history
-    # has only the noise of its own band. Noise alone gives it a power of 1.
+    # The peak is the largest of many samples, whose noise has the bandwidth of the whole PRF. The
+    # sum over the history has only the noise of its own band. It has a mean power of 1 if there is
+    # only noise.
     peak, total = ordered.amax(-1).double(), (tone * phasor.conj()).sum(-1).abs().square()
     q = (total / ((tone != 0).sum(-1).clamp_min(1) * or_one(floor)) - 1).clamp_min(0)
     # without noise, the error of the interpolation of the response is 2.5e-4 cycles per dwell

@@ -16,7 +16,7 @@ from torchsar.core import legendre, linear_phasor, linear_solve, unit_level, wra
 from torchsar.optim.scalar import vertex
 
 _HALF = 2  # samples per range cell, because |s|^2 has twice the band of s
-_QUARTER = 4  # samples per range cell in correlations, whose other factor is not band-limited
+_QUARTER = 4  # samples per range cell in correlations with -1 / T, which is not band-limited
 # least power of a cell in the likelihood, over the mean power, so that empty cells do not dominate
 _FLOOR = 1e-2
 # Least power of a tone in a periodogram, in units of its mean power, minus the logarithm of the

@@ -109,7 +109,7 @@ class _Ramps:
     position_s: Tensor  # time since the start of the triangle
     middle_s: Tensor  # time since the middle of the sweep
     rate: Tensor  # sweep rate with its sign
-    video: float  # 0.5, or 0 without the residual video phase
+    video: float  # factor of the residual video phase: 0.5, or 0 to leave this phase out
 
     @staticmethod
     def of(radar: TriangularLadar, time_s: Tensor, trigger_s: Tensor | float, video: float) -> _Ramps:

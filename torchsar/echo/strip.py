@@ -289,7 +289,7 @@ def _fits(placed: Placed, radar: StripmapRadar, n_range: int) -> Tensor:
 
 
 def _margin(radar: StripmapRadar) -> int:
-    """Number of samples of a pulse and of 256 samples of range migration, by choice."""
+    """Number of samples beyond a line: those of a pulse, and 256 for range migration, by choice."""
     return 256 + radar.pulse_samples
 
 

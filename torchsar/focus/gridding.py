@@ -345,7 +345,9 @@ class PulseNufft:
         return out.mT
 
     def _to_grid(self, rows: int, x: Tensor) -> Tensor:
-        """Adjoint of `_to_lines`, from (b, line, range) to some grid rows (b, row, range)."""
+        """Adjoint of `_to_lines`: image lines (b, line, range) to some rows of the grid, (b, row,
+        range).
+        """
         b, lines, columns = x.shape
         length, half, inside = self.length, lines // 2, min(rows, self.length)
         conj, out = self._factor.conj().resolve_conj(), x.new_empty(b, rows, columns)

@@ -85,8 +85,8 @@ def assess_imbalance(
     coherence = (lag.abs() / product.clamp_min(1e-300)).mean(-1).clamp(0, 1)
     gain_std, phase_std = (left_out_deviation(values) for values in left_out)
     share = (noise / power[..., None].clamp_min(1e-300)).clamp_max(0.99)
-    # An error of the noise level changes the ratios of the powers of the channels. It is three of
-    # the standard deviations of that level, or 3 % of the power where the level is not known.
+    # An error of the noise level changes the ratios of the powers of the channels. It is assumed to
+    # be three standard deviations of that level, or 3 % of the power if the level is not known.
     bias = torch.where(share > 0, 3 / math.sqrt(looks[1]) * share / (1 - share), 0.03)
     gain_std = root(gain_std.square() + (gain * torch.log(gain) * bias).square())
     # Limits by choice: a phase with a standard deviation above 0.25 rad may be that of noise. If

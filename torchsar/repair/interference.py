@@ -183,8 +183,8 @@ def subtract_interference(raw: Tensor, threshold: float = THRESHOLD, most_tones:
         if not anything(banded):
             break
         cleaned, touched = subtract_band(cleaned, banded, density), touched | banded
-    # lines are missing whose cells above the threshold contain more power than the clutter of the
-    # whole line
+    # a line counts as missing if its cells above the threshold contain more power than the clutter
+    # of the whole line
     power = line_spectra(cleaned.detach())
     left = (power * (excess_of(power, density) > threshold)).sum(-1)
     lost = touched & (left > density.sum(-1))

@@ -75,8 +75,9 @@ def _sign(like: Tensor) -> Tensor:
 
 
 def _shifted(error: Tensor, radar: TriangularLadar, delay_s: float) -> Tensor:
-    """Error at the time u from an error that is known at u - tc / 2, from its first complete sample
-    on.
+    """Convert errors known at the times u - tc / 2 to errors at the times u.
+
+    The first samples, in which the channel is incomplete, are not used.
     """
     lost, half = math.ceil(delay_s * radar.sample_rate_hz - 1e-9), delay_s * radar.sample_rate_hz / 2
     if lost > error.shape[-1] // 2:

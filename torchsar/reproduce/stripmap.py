@@ -107,7 +107,7 @@ def _strips(small: bool, doppler_hz: float = DOPPLER_HZ) -> list[_Strip]:
 
 
 def _uneven(small: bool) -> list[Recording]:
-    """Recordings of points at random positions, in any direction of the beam."""
+    """Recordings of points at random positions, which are not evenly distributed over the beam."""
     recordings = []
     for seed in seeds_of(small):
         draws = Draws(seed)

@@ -86,7 +86,8 @@ def smooth_near(
     places = (carrier_m + fringe_m * torch.round((about - carrier_m) / fringe_m))[..., None] + n
     far = ((places - near_m[..., None]) / near_std_m).square().clamp_max(3.0**2)
     weight = bend_std_m.clamp_min(1e-3 * fringe_m)[:, None, None, None].square().reciprocal()
-    # cost of the states (trial, last but one, last)
+    # cost (trial, place of the last pulse but one, place of the last pulse) of the best path that
+    # ends there
     cost, back = far[:, 0, :, None] + far[:, 1, None, :], []
     for p in range(2, places.shape[1]):
         here, before, earlier = (places[:, p - i] for i in range(3))
@@ -195,9 +196,9 @@ def drift_m(profiles: Tensor, frequency_hz: Tensor, imaging: Imaging, slopes: bo
     unit = 0.4 * LIGHT_M_S / (2 * float(frequency_hz[-1] - frequency_hz[0]))
     rate = (frequency_hz - frequency_hz.mean()) * (-2 / LIGHT_M_S)  # cycles per metre
     time = torch.linspace(-1, 1, pulses, dtype=torch.float64, device=samples.device)
-    # Polynomials up to degree 6, by trial. Those of degree 2 and more are constant outside of the
-    # middle 0.8 of the record. The Hann window is below a tenth there, so that the ends would be
-    # hardly determined.
+    # The drift over the pulses is described by polynomials up to degree 6, by trial. Those of
+    # degree 2 and more are constant outside of the middle 0.8 of the record. The Hann window is
+    # below a tenth there, so that the ends would hardly be determined.
     bent = legendre(time.clamp(-0.8, 0.8), 6)[:, 2:]
     basis = torch.cat([time[:, None], bent], 1).mT * unit
 
@@ -213,7 +214,7 @@ def drift_m(profiles: Tensor, frequency_hz: Tensor, imaging: Imaging, slopes: bo
         log = torch.log((power / total).clamp_min(torch.finfo(power.dtype).tiny))
         value = -(power * log).sum() / total
         back = frequency_samples(imaging.adjoint(image * (-(log + value) / total)))
-        # derivative of the samples by the drift: 2j pi rate times the samples
+        # derivative of the samples with respect to the drift: 2j pi rate times the samples
         of_pulse = (-4 * math.pi) * ((back.conj() * at).imag.double() * rate).sum(-1)[0]
         return value.double()[None], (basis @ of_pulse)[None]
 

@@ -138,11 +138,12 @@ def _units(operator: TileOperator, scene: Tensor, axes: Tensor) -> tuple[Tensor,
     some = [torch.linspace(0, n - 1, 3).round().long() for n in grid.counts]
     lines = (torch.linspace(-1, 1, n, dtype=torch.float64, device=scene.device) for n in grid.counts)
     u, v = torch.meshgrid(*lines, indexing="ij")
-    terms = torch.stack([torch.ones_like(u), u, v, u.square(), u * v, v.square()])  # (term, azimuth, range)
+    # dimensions (term, azimuth, range)
+    terms = torch.stack([torch.ones_like(u), u, v, u.square(), u * v, v.square()])
     known = terms[:, some[0]][..., some[1]].flatten(1)
     places = grid.pixels_m()[some[0]][:, some[1]].reshape(-1, 3)
     lever = (slope(operator.plan.antennas.places, places[:, None])[..., None, :] * axes).sum(-1).movedim(0, 1)
-    share = torch.linalg.pinv(known.mT) @ lever  # (pulse, term, axis)
+    share = torch.linalg.pinv(known.mT) @ lever  # dimensions (pulse, term, axis)
     radians = 4j * math.pi * float(operator.plan.frequency_hz.mean()) / LIGHT_M_S
     # the terms are processed one after another, so that they use the same tables as the other
     # images

@@ -449,7 +449,7 @@ class Curve:
             cosine, axis * cosine); and the phase that the terms of each scatterer add, float64
             (scatterer, seen).
         """
-        # share by which the information is increased against rounding
+        # ridge: relative increase of the information, so that rounding does not make it singular
         axes, count, ridge = *power.shape, 1e-9
         pull = weight[..., None] * self.own
         normal = pull.mT @ self.own

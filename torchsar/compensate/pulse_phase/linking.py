@@ -28,7 +28,7 @@ from torchsar.compensate.pulse_phase.linking_assess import Judged, judged, outco
 from torchsar.compensate.pulse_phase.stages import _PhaseEstimatorFromStart
 from torchsar.core import Estimate, Outcome, cis, differentiable
 
-_BLOCK_BYTES = 64 << 20  # limits the memory of a block of trials
+_BLOCK_BYTES = 64 << 20  # largest memory of the working arrays of a block of trials
 
 
 @differentiable("no")

@@ -66,7 +66,8 @@ class Neighbours:
         near = (near & used[:, :, None] & used[:, None]).flatten()
         number = torch.arange(1, n + 1, device=cell.device)
         pairs, width = torch.stack([near.sum(), (used * number).amax()]).tolist() if len(near) else (0, 0)
-        # the indices where `near` is true; all others are written to one additional entry
+        # indices where `near` is true; all other indices are written to one additional entry, which
+        # is dropped
         place = torch.where(near, near.cumsum(0) - 1, pairs)
         every = torch.arange(len(near), device=cell.device)
         index = every.new_empty(pairs + 1).scatter_(0, place, every)[:pairs]

@@ -134,8 +134,10 @@ def _points(scene: Scene, width: int, depth: int, wanted: float) -> list[tuple[i
 
 
 def _choose_slope(scene: Scene, sampled: Sampled, error: float) -> tuple[tuple[int, float, float], float] | None:
-    """Slope of the window in samples, its guard share of the band, and oversampling of the
-    profiles, for a wanted error of the window. And the error that it has.
+    """Choose the window for a wanted error: slope in samples, guard share of the band, and
+    oversampling.
+
+    Also returns the error that the window has. The result is None if no window is suitable.
     """
     found, cells, (low, carrier, high) = [], 24, scene.waves
     # a tenth more than in the sampled pulses

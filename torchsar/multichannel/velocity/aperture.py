@@ -117,7 +117,7 @@ class SeenAperture:
 
     def weight(self, radar: BistaticRadar, motion: PointMotion, time_s: Tensor) -> Tensor:
         """Return the expected amplitude times the profile, see `Dwell.weight`."""
-        # dimensions for several hypotheses per trial
+        # dimensions of length one for several hypotheses per trial
         more = max(0, motion.trial_dims + 1 - self.profile.ndim)
         return self.aperture.weight(radar, motion, time_s) * self.profile[(..., *[None] * more, slice(None))]
 

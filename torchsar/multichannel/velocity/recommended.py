@@ -111,8 +111,7 @@ def moving_point_velocity(
     clutter = sample_whitening(job.data, radar)
     job, found = job.as_seen(job.found(clutter), clutter)
     other, rest_of_other = job.refined(found)
-    # the job with the smaller log determinant is likelier
-    # decided for each trial independently
+    # in each trial, the job with the smaller log determinant is likelier
     first = ~rest.coloured | (rest.log_det <= rest_of_other.log_det)
     return white.or_other(job, first).estimate(
         _chosen_fit(plain, other, first),

@@ -72,10 +72,10 @@ SHOWN = ("uncompensated", "cross-correlation", "segmented")
 
 
 class _Seen(NamedTuple):
-    """The record of the first draw and the results of every method, and numbers of all draws by
-    method.
+    """Results of one experiment.
 
-    calm: numbers of the segmented method in still air.
+    The record, the truth and the results of every method are those of the first draw. numbers:
+    metrics of every draw by method. calm: metrics of the segmented method in still air.
     """
 
     recording: Recording

@@ -40,7 +40,8 @@ log = logging.getLogger("torchsar")
 _NOT_IDENTITY: Any = dict.fromkeys(("sweep", "trade", "title", "seed", "random", "cases", "beyond_limits"), True) | {
     "processor": {"__all__": {"title"}}
 }
-# results that differ when the same trial is repeated, and those that follow from others
+# results that change when the same trial is repeated, such as times, or that follow from other
+# results
 _NOT_RESULTS = ("seconds", OK)
 _FIXED = ("sweep", "seed", "random", "data", "title", "trade", "system", "cases")
 
