@@ -142,7 +142,7 @@ def test_the_command_makes_one_item(tmp_path: Path, capsys: pytest.CaptureFixtur
         (["nowhere"], "there is no paper 'nowhere'; choose one of sal, geo, isal, isal_rotation, stripmap"),
         (
             ["sal", "table9"],
-            "the paper of sal has no 'table9'; it has figure1 to figure19, table1 to table6, text1 to text3",
+            "the paper of sal has no 'table9'; it has figure1 to figure19, table1 to table6, text1 to text4",
         ),
     ],
 )

@@ -10,9 +10,10 @@ from __future__ import annotations
 import logging
 import math
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 
@@ -43,11 +44,11 @@ SIZES = {False: (11_720, 17_500), True: (7_000, 1_400)}
 
 
 class _Frame(NamedTuple):
-    """Measurements of the processing of a frame: CPU and wall time (s), threads, peak memory of the
-    process (GB), error of the velocity (m/s), and number of samples.
+    """Measurements of the processing of a frame: CPU time of each part and wall time (s), threads,
+    peak memory of the process (GB), error of the velocity (m/s), and number of samples.
     """
 
-    processor_s: float
+    processor_s: dict[str, float]
     wall_s: float
     threads: int
     peak_gb: float
@@ -84,32 +85,37 @@ def _frame(small: bool, off_m_s: float = 2.0, width: int = 1024) -> _Frame:
     near = max(0, (samples - width) // 2)
     group = raw.isel(range=slice(near, near + width))
     velocity = EffectiveVelocity(OmegaK(replace(SENSOR, near_range_m=group.axes[-1].start)), reach_m_s=20.0)
-    began = time.process_time(), time.perf_counter()
-    log.info("frame: Doppler centroid")
-    centroid = doppler(group)["doppler_hz"]
-    log.info("frame: velocity")
-    speed = velocity(group, doppler_hz=centroid)["velocity_m_s"]
-    log.info("frame: focusing")
-    image = focus(raw, doppler_hz=centroid, velocity_m_s=speed)
-    log.info("frame: modulus")
-    amplitude = Detect()(image)
-    spent = time.process_time() - began[0], time.perf_counter() - began[1]
+    spent, began = dict[str, float](), time.perf_counter()
+
+    def timed(part: str, work: Callable[..., Any], *given: Any, **values: Any) -> Any:
+        log.info("frame: %s", part)
+        start = time.process_time()
+        result = work(*given, **values)
+        spent[part] = time.process_time() - start
+        return result
+
+    centroid = timed("Doppler centroid", doppler, group)["doppler_hz"]
+    speed = timed("velocity", velocity, group, doppler_hz=centroid)["velocity_m_s"]
+    image = timed("focusing", focus, raw, doppler_hz=centroid, velocity_m_s=speed)
+    amplitude = timed("modulus", Detect(), image)
+    wall = time.perf_counter() - began
     import resource  # the module is not available on all operating systems
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
     off = float(speed) - SENSOR.velocity_m_s - off_m_s
-    return _Frame(*spent, torch.get_num_threads(), peak, off, amplitude.data.numel())
+    return _Frame(spent, wall, torch.get_num_threads(), peak, off, amplitude.data.numel())
 
 
 def _text_1(seen: _Frame, path: Path) -> list[Check]:
-    quiet, off = seen.processor_s / 2, abs(seen.velocity_m_s)
+    whole, off = sum(seen.processor_s.values()), abs(seen.velocity_m_s)
+    parts = ", ".join(f"{part} {seconds:.1f} s" for part, seconds in seen.processor_s.items())
     ours = (
-        f"{seen.samples / 1e6:.0f} million samples in {seen.processor_s:.0f} processor seconds, {quiet:.0f} s on two "
-        f"quiet cores; {seen.wall_s:.0f} s of wall time with {seen.threads} threads on the machine as it was; memory "
-        f"of the process {seen.peak_gb:.1f} GB at most"
+        f"{seen.samples / 1e6:.0f} million samples in {whole:.0f} s of one processor ({parts}; threads: "
+        f"{seen.threads}); {seen.wall_s:.0f} s of wall time on the machine as it was; memory of the process "
+        f"{seen.peak_gb:.1f} GB at most"
     )
     return [
-        statement("10 x 10 km", "less than a minute", quiet < 60 and seen.peak_gb < 8, ours),
+        statement("10 x 10 km", "less than a minute", whole < 60 and seen.peak_gb < 8, ours),
         statement("error of the velocity", "1 m/s is allowed", off < 1, f"{off:.2f} m/s"),
     ]
 

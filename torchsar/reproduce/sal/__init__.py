@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from torchsar.reproduce.item import Check, Item, Paper, given, in_order, number, statement
-from torchsar.reproduce.sal import ground, letter, points
+from torchsar.reproduce.sal import ground, isolated, letter, points
 
 __all__ = ["PAPER"]
 __dir__ = __all__.copy
@@ -28,6 +28,7 @@ PAPER = Paper(
         *points.ITEMS,
         *letter.ITEMS,
         *ground.ITEMS,
+        *isolated.ITEMS,
         given(
             "Text 1",
             "range cell (sections 3.1 and 3.3)",
