@@ -76,8 +76,7 @@ class _Seen(NamedTuple):
     """Results of one experiment.
 
     The record, the truth and the results of every method are those of the first draw. numbers:
-    metrics of every draw by method. air: metrics of the
-    segmented method in the settings of `AIR`.
+    metrics of every draw by method. air: metrics of the segmented method in the settings of `AIR`.
     """
 
     recording: Recording
