@@ -143,7 +143,7 @@ def point_history(
     history = torch.fft.ifft(spectrum * cis(math.pi * offset.square() / rate))
     lines = (
         torch.round(start_s[..., None] * prf_hz) - n // 2 + torch.arange(n, dtype=torch.float64, device=image.device)
-    )  # the peak of the response is in the middle
+    )  # pulse numbers relative to the start, with the peak of the response in the middle
     since = lines / prf_hz - start_s[..., None]
     tone = (
         history.gather(-1, torch.remainder(lines, n).long())

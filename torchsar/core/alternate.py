@@ -137,7 +137,8 @@ class Alternate(Stage):
             last used. Keys of `info` are "TURN.KEY", with the name of the turn in front.
         """
         found: dict[str, Estimate] = {}
-        used: dict[str, list[Tensor]] = {}  # outcomes of the values of the others
+        # for each estimator: outcomes of the values of other estimators that it used
+        used: dict[str, list[Tensor]] = {}
         for _ in range(self.rounds):
             for name, estimator in self.estimators.items():
                 values = {key: value for estimate in found.values() for key, value in estimate.value.items()}

@@ -138,7 +138,7 @@ class WideInterferer:
         data, fs = recording.signal.data, recording.radar.sampling_hz
         lines = _chosen_lines(draws, self.share, data)
         n_pulse, n = data.shape[-2:]
-        # there are at least 8 random coefficients, however narrow the band is
+        # length of the process, which has at least 8 random coefficients in any band
         n_long = max(2 * n, math.ceil(8 * fs / self.bandwidth_hz))
         half = int(self.bandwidth_hz / 2 / fs * n_long)
         coefficients = draws.normal("wide.coefficients", (n_pulse, 2 * half + 1), data.dtype, data.device)

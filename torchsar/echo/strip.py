@@ -256,7 +256,7 @@ def _times_and_gain(
     range_m = torch.sqrt(some.closest_m.square() + (speed * since).square())
     if some.along_m_s is None or some.closing_m_s is None:
         ahead = velocity_m_s.square() * -since
-    else:  # the beam knows directions, not the speed of the target
+    else:  # the gain depends on the direction of the target, not on its speed
         ahead = -velocity_m_s * (some.along_m_s * since + some.closing_m_s / speed * some.closest_m)
     offset = 2 * ahead / (radar.wavelength_m * range_m) - doppler_hz
     weight = world.beam.weight(pulse_s[:, None] - some.crossing_s, offset, velocity_m_s)

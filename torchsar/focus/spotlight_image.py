@@ -110,7 +110,9 @@ def scene_grid(
             stacklevel=3,
         )
     clear = (2 * window_m / float(along[:, 0].abs().max()), LIGHT_M_S / (float(frequency_hz[-1]) * usual))
-    if near and float(centre.norm()) > 0:  # the unambiguous extent grows with the range
+    # the unambiguous extent in azimuth is proportional to the range and is computed for the far
+    # edge
+    if near and float(centre.norm()) > 0:
         farther = 1 + extent[0] / 2 / float((centre - torch.stack(antennas.places).mean((0, 1))).norm())
         clear = (clear[0], clear[1] * farther)
     step = 1 / (_OVERSAMPLING * max(band))

@@ -217,7 +217,7 @@ def plan_strip(
         )
     height = max((h for h in range(max(least, height // 2), height + 1) if smooth_length(h) == h), default=height)
     step = (height - overlap) // multiple * multiple
-    # equal steps, so that the last block is no shorter
+    # lines per block if all blocks have nearly equal lengths, so that the last one is not shorter
     even = math.ceil(n_lines / math.ceil(n_lines / step) / multiple) * multiple
     height = min(height, smooth_length(overlap + even))
     return StripPlan(n_lines, height, reach, height * line_bytes, multiple)

@@ -166,7 +166,7 @@ def _content(
     spacing = LIGHT_M_S / (2 * band)
     counts = [max(1, math.ceil((high[i] - low[i]) / spacing)) for i in (0, 1)]
     grid = {
-        # number of lines and samples before the origin
+        # line and sample of the origin of the scene coordinates
         "IARPLocation": [round(-low[i] / spacing - 0.5) for i in (0, 1)],
         "IAXExtent": {"LineSpacing": spacing, "FirstLine": 0, "NumLines": counts[0]},
         "IAYExtent": {"SampleSpacing": spacing, "FirstSample": 0, "NumSamples": counts[1]},

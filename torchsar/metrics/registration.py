@@ -255,7 +255,7 @@ def _peak(z: Tensor, turns: list[Tensor], start: list[Tensor] | None = None) -> 
         ]
     found = list(start)
     for _ in range(_REFINED):
-        for dim, t in enumerate(turns):  # along one axis after the other
+        for dim, t in enumerate(turns):  # the Newton steps are made along one axis after the other
             turned, w = z * _ramp(turns, found), 2 * math.pi * t
             s0, s1, s2 = (x.sum((-2, -1), keepdim=True) for x in (turned, 1j * w * turned, -w.square() * turned))
             rise = 2 * (s1 * s0.conj()).real

@@ -107,7 +107,8 @@ def assessed_balance(
 
 
 def _score(lines: Tensor, inner: Tensor, dim: int, weight: Tensor | float = 1.0) -> Tensor:
-    """Return the gradient by logarithms and phases, averaged over `dim`, (..., 2 channel, n).
+    """Return the mean gradient over `dim` with respect to logarithms and phases, (..., 2 channel,
+    n).
 
     Args:
         lines: Balanced lines, (..., channel, bin, cell).

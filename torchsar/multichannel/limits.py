@@ -272,7 +272,7 @@ def _estimator_limits(radar: BistaticRadar, use: MultichannelUse) -> list[Limit]
     of_sample = Limit(
         "SNR of a sample for the intensity ratio",
         snr_db,
-        7.0,  # upper end of the threshold, which lies at 0 to 7 dB
+        7.0,  # upper end of the range 0 to 7 dB in which the threshold is
         "dB",
         "warn",
         "the ratio is below its threshold",

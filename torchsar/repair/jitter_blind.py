@@ -76,7 +76,8 @@ def cyclic_fit(
     for k in range(1, period // 2 + 1):
         step = k * (n // period)
         own = floor * (noise * torch.roll(noise, step, -1).conj()).mean(-2)
-        both = power + torch.roll(power, step, -1)  # the correlation that a periodic gain causes
+        # form of the correlation that a periodic gain causes
+        both = power + torch.roll(power, step, -1)
         # leakage from the ends of a line adds at least 1e-5 of the mean power to every frequency
         weight = 1 / (power.clamp_min(1e-5) * torch.roll(power, step, -1).clamp_min(1e-5))
         slope = 2j * math.pi * (torch.roll(tilted, step, -1) - tilted)

@@ -201,7 +201,7 @@ def line_integrity(
     # row 0 is the first received line, whether its own number is correct or not
     origin = _first(verified) if first_number is None else ok * first_number
     highest, lowest = _extremes(offset, trusted)
-    lossy = highest[..., -1:] > lowest[..., :1]  # true if lines are lost between the accepted ones
+    lossy = highest[..., -1:] > lowest[..., :1]  # True where lines are lost between accepted lines
     outside = ok[..., None] & ~_enclosed(trusted) & lossy
     verified = torch.where(outside, PADDING, verified)
     slot = verified - origin[..., None]

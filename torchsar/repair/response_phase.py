@@ -140,7 +140,8 @@ def halved(weight: Tensor, line: Tensor) -> Tensor:
     """
     used = weight > 0
     place = torch.where(used, line, line.amax() + 1)
-    first = torch.searchsorted(place.sort(-1).values, place)  # number of windows in lines before
+    # number of windows in the lines before the line of each window
+    first = torch.searchsorted(place.sort(-1).values, place)
     quarter = 4 * first // used.sum(-1, keepdim=True).clamp_min(1)
     inner = (quarter == 1) | (quarter == 2)
     return torch.cat([weight * ~inner, weight * inner])

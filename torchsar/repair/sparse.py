@@ -259,7 +259,8 @@ class SubLooks:
         self.windows = windows[..., None, :].to(real)
         looks, n = len(windows), windows.shape[-1]
         self.step = max(q for q in range(1, max(1, looks // 2) + 1) if n % q == 0)
-        # the inverse FFT of the folded spectrum is larger by the factor `step`
+        # the factor `step` is included because the inverse FFT of the folded spectrum is larger by
+        # it
         self.share = self.step**2 * windows.square().mean(-1)[..., None, None].to(real)
 
     def _pixels(self, spectra: Tensor, window: Tensor) -> Tensor:
@@ -321,7 +322,7 @@ class SubLooks:
         def weighted(rows: slice) -> Tensor:
             total = torch.zeros_like(spectra[..., rows, :])
             for window, w in zip(self.windows, weight, strict=True):
-                # the adjoint of `_pixels`
+                # adjoint of `_pixels`
                 folded = torch.fft.fft(w[..., rows, :] * self._pixels(spectra[..., rows, :], window))
                 total = total + window * torch.cat([folded] * self.step, -1)
             return total

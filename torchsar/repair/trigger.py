@@ -328,7 +328,7 @@ def _fringe(
     sigmas = _sigmas(take(gain.movedim(-1, -2), best, -2)[..., None] - gain)
     others = torch.arange(len(order), device=base.device) != best[..., None]
     certainty = torch.where(others, torch.where(excluded, clear, sigmas), torch.inf).amin(-1)
-    # at an end of the search, fringes beyond it may be better
+    # the certainty is zero at an end of the search, since fringes beyond it may fit better
     beyond = (best == 0) | (best == len(order) - 1) | excluded.all(-1)
     certainty = torch.where(beyond, 0, certainty)
     chosen = torch.where(certainty > 3, take(offsets, best), expected)

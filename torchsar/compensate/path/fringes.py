@@ -194,7 +194,8 @@ def drift_m(profiles: Tensor, frequency_hz: Tensor, imaging: Imaging, slopes: bo
     samples, pulses = frequency_samples(profiles), len(profiles)
     # a drift of 0.4 cells is the unit of the search, so that its first step is small
     unit = 0.4 * LIGHT_M_S / (2 * float(frequency_hz[-1] - frequency_hz[0]))
-    rate = (frequency_hz - frequency_hz.mean()) * (-2 / LIGHT_M_S)  # cycles per metre
+    # cycles per metre of displacement
+    rate = (frequency_hz - frequency_hz.mean()) * (-2 / LIGHT_M_S)
     time = torch.linspace(-1, 1, pulses, dtype=torch.float64, device=samples.device)
     # The drift over the pulses is described by polynomials up to degree 6, by trial. Those of
     # degree 2 and more are constant outside of the middle 0.8 of the record. The Hann window is

@@ -133,7 +133,7 @@ def placed(x: Tensor, present: Tensor) -> Tensor:
 
 
 def slope(places: Sequence[Tensor], points_m: Tensor) -> Tensor:
-    """Return the derivative of half the path to points by the position of the antennas.
+    """Return the derivative of half the path with respect to the position of the antennas.
 
     Args:
         places: Positions of one or both antennas, which move together, in metres, (..., 3).

@@ -142,7 +142,7 @@ def strip_autofocus(
             if fitted is None:
                 return none
             after, covariance, power, echoes = fitted
-            # standard deviation without the line over the judged pulses
+            # standard deviation over the judged pulses, without the constant and linear part
             std = ((free @ covariance) * free).sum(-1).clamp_min(0).sqrt()
             change, strip = strip.changed_m2(after), after
             if change < 0.3**2 * std[strip.judged].square().mean():

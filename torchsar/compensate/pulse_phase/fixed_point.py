@@ -153,8 +153,9 @@ def weighted(image: Tensor, weights: Weights, mean: Tensor | None = None) -> Ten
 class LogAbove:
     """Weights ln(max(p, floor) / floor) of image cells, with p the power over the mean power.
 
-    Above the floor the weight of a cell is the derivative of the image entropy by the power of the
-    cell, apart from sign, a common factor and an added constant; below it the weight is zero.
+    Above the floor the weight of a cell is the derivative of the image entropy with respect to the
+    power of the cell, apart from sign, a common factor and an added constant. Below it the weight
+    is zero.
 
     Args:
         floor: Floor as a multiple of the mean power of the image, a number or shape (trial, 1, 1).

@@ -154,7 +154,7 @@ def _coherence(rows: Tensor, groups: Tensor, cells: Tensor, independent: Tensor)
     row = kinds * energy.sum(-1)
     looks = row.sum(-1).square() / or_one(row.square().sum(-1)) * independent
     excess = torch.zeros_like(cells)
-    lags = min(4, n - 1)  # largest distance of the pulses
+    lags = min(4, n - 1)  # largest number of pulses between two pulses whose coherence is used
     for lag in range(1, lags + 1):
         product = torch.einsum("gtr,trp->gtp", kinds.to(rows.dtype), rows[..., lag:] * rows[..., :-lag].conj())
         square = power_of(product).sum(-1)

@@ -152,7 +152,7 @@ class Speckle:
             tones = torch.fft.fft(inverse.mT @ (own * u.conj()[..., None]), 2 * n, dim=-2)
             sums = torch.roll(torch.nn.functional.pad(lag_sums(inverse.mT * kept), (1, 0)), -n, -1)
             gain = torch.fft.fft(sums).real
-            # rounding limits densities relative to the mean to 1e-8
+            # the limit 1e-8 for the relative density below is that of rounding errors
             power = power_of(tones).sum(-1) / gain.square()
             spectra.append(self._smoothed(power * self.present.sum(-1)[:, None], cells, smoothed_spectrum, 1e-8))
         return spectra

@@ -227,8 +227,9 @@ def _turns(waves: Tensor, slopes: Tensor, matrix: Tensor, amplitudes: Tensor, le
     """Gauss-Newton step of the Dopplers in rad per pulse, (trial, line), at most a quarter of a
     Doppler cell.
 
-    slopes: derivatives of the waves by their Dopplers, (trial, line, pulse) as `waves`. The part of
-    them that a change of the amplitudes explains is removed. matrix: inner products of the waves.
+    slopes: derivatives of the waves with respect to their Dopplers, (trial, line, pulse) as
+    `waves`. The part of them that a change of the amplitudes explains is removed. matrix: inner
+    products of the waves.
     """
     mixed = waves.conj() @ slopes.mT
     free = slopes.conj() @ slopes.mT - mixed.mH @ torch.linalg.solve_ex(matrix, mixed)[0]

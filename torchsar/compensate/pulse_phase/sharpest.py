@@ -197,7 +197,9 @@ def _summed(functions: Tensor, x: Tensor) -> Tensor:
 
 
 def _projected(functions: Tensor, gradient: Tensor) -> Tensor:
-    """Gradient (trial, coordinate) by the weights of functions, from the gradient by the phases."""
+    """Gradient (trial, coordinate) with respect to the weights of functions, from that with respect
+    to the phases.
+    """
     return (functions @ gradient[..., None])[..., 0]
 
 
@@ -300,7 +302,7 @@ def _derived(
 
 
 def power_entropy(rows: Tensor, mirrored: Tensor, phase_rad: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute the entropy of the image and its gradient by the phases.
+    """Compute the entropy of the image and its gradient with respect to the phases.
 
     dE/dpsi_k = -(2 / F) Im sum_n x conj(IFFT((1 + ln p) f)), where F is the energy. Any constant
     may be omitted from (1 + ln p).

@@ -355,7 +355,7 @@ class Spectra:
         filters = torch.stack(
             [shape.to(kept.dtype) * _line_phase(first, lines, m, sign, not video, radar, kept) for sign in (1, -1)]
         )
-        # phases refer to the middle of the sweep
+        # middle of the window in bins; the phases are made to refer to the middle of the sweep
         middle = torch.stack([first + shift, shift - first], -2).to(torch.float64)
         turned = cis((math.pi * middle * ((n - 1) / n) % (2 * math.pi)).to(real_dtype(kept.dtype)))
         series = torch.fft.ifft(kept * filters[:, None, :] * (turned * self.scale[..., 0])[..., None], m) * (m / n)

@@ -171,7 +171,8 @@ def _log_spectra(data: Tensor, length: int) -> Tensor:
     """
     window = torch.hann_window(length, periodic=False, dtype=data.real.dtype, device=data.device)
     spectrum = torch.fft.fft(data.unfold(1, length, length // 2) * window, 2 * length).abs()
-    reach = 3.5 * math.log(2)  # 3.5 octaves below the edge of the band, found by trial
+    # extent of the logarithmic axis: 3.5 octaves below the edge of the band, found by trial
+    reach = 3.5 * math.log(2)
     steps = math.ceil(reach * _STEPS_PER_UNIT)
     logs = torch.arange(steps, dtype=torch.float64, device=data.device) / _STEPS_PER_UNIT - reach
     position = torch.exp(logs) * (length - 1)

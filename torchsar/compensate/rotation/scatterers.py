@@ -158,7 +158,7 @@ def fit_scatterers(
     fit = Fit(
         start,
         Scatterers(empty.to(torch.complex128), empty, empty),
-        # initial share of the periodic response, midway between the two kinds
+        # initial share of the periodic range response, half way between 0 and 1
         start.w.new_full((len(data),), 0.5),
         start.w.new_full((len(data),), math.inf),
         torch.zeros(len(data), dtype=torch.int64, device=device),

@@ -170,12 +170,13 @@ def _hopeless(sizes: tuple[int, int, int, int], other: tuple[int, int, int, int]
 
 
 def _sizes(scene: Scene, error_db: float) -> list[tuple[int, int, int, int]]:
-    """Sizes (width, depth, parts, order), ordered by the estimated time of the image.
+    """Sizes (width, depth, parts, order) of tiles, ordered by the estimated computing time of the
+    image.
 
-    The time follows from the slopes of the path at pixels that most pulses light. It also depends
-    on the taps and the slope of the window for half of the error, which these usually may take. Its
-    factors in ns are those of 13 plans on one core: per sample of a window or of its spectrum, per
-    flop of a product, per element of the expansion, and per tile.
+    The time follows from the slopes of the path at pixels that most pulses light. The kernel and
+    the window are those for half of the error, which is usual. The factors in ns were fitted to the
+    times of 13 plans on one core. They apply per sample of a window or of its spectrum, per flop of
+    a product, per element of the expansion, and per tile.
     """
     grid, (low, _, high) = scene.grid, scene.waves
     usual, per_metre, share = (

@@ -160,7 +160,8 @@ def _window_squares(rise: int, guard: float) -> Tensor:
     """
     turns = torch.linspace(-0.5, 0.5, _ENTRIES, dtype=torch.float64)[:, None] * (1 - guard)
     slope, found = window_slope(rise, guard), torch.zeros(_ENTRIES, len(_DISTANCES), dtype=torch.float64)
-    for flat in (len(_DISTANCES), len(_DISTANCES) + 2):  # the farthest distance is in the middle
+    # two lengths of the flat part, with the largest tabulated distance in its middle
+    for flat in (len(_DISTANCES), len(_DISTANCES) + 2):
         length = flat + rise
         weights = torch.cat([slope, slope.new_ones(flat), slope.flip(0)])
         m = torch.arange(flat + 2 * rise, dtype=torch.float64) - flat / 2 - rise

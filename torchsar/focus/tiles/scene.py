@@ -214,7 +214,7 @@ class Scene:
         """Return the scene for trials with other positions, (trial, pulse, 3) each. The nominal
         path of the tiles remains that of this scene.
         """
-        other = copy.copy(self)  # the copy keeps the pulses that were found to light the image
+        other = copy.copy(self)  # contains the pulses that light the image, if they are known
         object.__setattr__(other, "judged", judged)
         other.__dict__.pop("farthest", None)
         return other

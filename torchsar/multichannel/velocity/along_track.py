@@ -370,7 +370,8 @@ def _fit_at(data: Tensor, radar: BistaticRadar, motion: PointMotion, weight: Ten
     ).clamp_min(1)
     level = amplitude[..., None, None]
     beside = noise_beside(deramped - level * weight, weight, level, 3)
-    # derivatives of tone and phase slope by u_r and y0; other effects of u_r and y0 are not used
+    # derivatives of tone and phase slope with respect to u_r and y0; other effects of u_r and y0
+    # are not used
     v, near = (x[..., None, None] for x in (motion.along_m_s, motion.range_m))
     by_y0 = (v * time_s - radar.channels_at(time_s.device)[:, None]) / near
     slopes = 2 * math.pi / radar.wavelength_m * torch.stack([time_s.expand_as(by_y0), by_y0], -3)

@@ -109,7 +109,7 @@ def _compared(
     if assumed:
         unknowns = tuple(dict.fromkeys((*unknowns, "u_a_m_s")))
     time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
-    # the energies compared are those of the same pulses
+    # fixed weights, so that the energies of all hypotheses are those of the same pulses
     aperture = Kept(aperture.weight(radar, found.motion, time_s))
     fits = []
     for number in (-1, 0, 1):

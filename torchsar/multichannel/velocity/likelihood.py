@@ -145,7 +145,9 @@ class PointLikelihood:
         )
 
     def fit(self, motion: PointMotion) -> PointFit:
-        """Return the least-squares amplitude for a motion, with derivatives by the unknowns."""
+        """Fit the amplitude for a motion by least squares, with derivatives with respect to the
+        unknowns.
+        """
         slopes = phase_slopes(self.radar, motion, self.time_s, self.unknowns)
         phasor = point_phasor(self.radar, motion, self.time_s, torch.complex128)
         if self.whitening is None:

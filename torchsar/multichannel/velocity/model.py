@@ -48,7 +48,7 @@ def point_phasor(radar: BistaticRadar, motion: PointMotion, time_s: Tensor, dtyp
 def phase_slopes(
     radar: BistaticRadar, motion: PointMotion, time_s: Tensor, unknowns: tuple[str, ...] = UNKNOWNS
 ) -> Tensor:
-    """Return the derivatives of the phase of `point_phasor` by the unknowns.
+    """Return the derivatives of the phase of `point_phasor` with respect to the unknowns.
 
     Args:
         radar: Radar parameters.
@@ -158,7 +158,7 @@ def noise_beside(left: Tensor, weight: Tensor, amplitude: Tensor, fitted: int, c
     """
     n = left.shape[-1]
     energy = weight.square().sum((-2, -1))
-    # ratio for each bin, in Doppler cells
+    # width of a bin of the FFT in Doppler cells
     per_bin = energy.square() / weight.square().square().sum((-2, -1)).clamp_min(TINY) / n
     inside = torch.fft.fftfreq(n, 1 / n, dtype=torch.float64, device=left.device).abs() * per_bin[..., None] <= cells
     turned = (left * torch.polar(torch.ones_like(amplitude.abs()), -amplitude.angle())).imag

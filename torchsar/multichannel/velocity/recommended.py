@@ -246,7 +246,9 @@ class _Job:
         )
 
     def resolved(self, found: Found, whitening: Whitening | None) -> Found:
-        """Choose the likeliest of the speeds lambda PRF apart that lie within the search."""
+        """Choose the likeliest of the speeds in the search that differ by multiples of
+        lambda PRF.
+        """
         span, begin = self.radar.ambiguous_velocity_m_s, found.motion
         reach = self.search.u_r_m_s + self.search.u_r_step_m_s
         most = torch.zeros_like(found.energy)

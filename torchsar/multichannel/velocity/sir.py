@@ -276,14 +276,13 @@ class SignalIntensityRatio(ChannelStage):
 def _standard_deviation(log_ratio: Callable[[Tensor, int], Tensor], value: Tensor, rest_m_s: float) -> Tensor:
     """Return the jackknife standard deviation (...,) of the maximum of log Gamma.
 
-    The noise of log Gamma changes over less than 0.25 m/s, so that its slope depends on the step.
-    Slope and curvature are taken over the interval about the maximum in which noise may displace
-    it. The systematic error `rest_m_s` is included.
-
-    The half steps were found by trial. With a fixed one of 0.5 m/s, errors are 0.6, 0.75 and 1.0 of
-    the prediction at 10, 13 and 17 dB per sample. With 1 m/s they are 1.0, 1.2 and 1.8. The second
-    one is the step at which the maximum has fallen by 1.8 standard deviations of the noise of ln
-    Gamma. Predictions then hold within 10 % from 10 to 25 dB.
+    The noise of log Gamma changes over less than 0.25 m/s, so that the standard deviation of its
+    slope depends on the half step of the difference. Slope and curvature are therefore taken over
+    the interval about the maximum in which noise may displace it: log Gamma falls there by 1.8
+    standard deviations of its noise. With this half step, predicted errors are correct within 10 %
+    from 10 to 25 dB per sample. Fixed half steps of 0.5 m/s and 1 m/s were also tried. With them,
+    errors at 10, 13 and 17 dB were 0.6 to 1.0 and 1.0 to 1.8 of the prediction. The systematic
+    error `rest_m_s` is included.
     """
     step = torch.full_like(value, 0.75)
     spread, bend = _slope_and_bend(log_ratio, value, step)

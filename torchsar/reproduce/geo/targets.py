@@ -40,7 +40,7 @@ from torchsar.reproduce.item import Check, Fact, Item, Made, number, statement
 from torchsar.scene import BandLimited, BistaticWorld, MovingPoints
 from torchsar.study.trials.cuts import finer
 
-# radar whose echo contains the range to the satellite
+# radar with a varying range to the satellite, which is contained in the echo
 RADAR = replace(SENSOR, transmit_range=TRANSMIT_RANGE)
 # (u_r, u_a) of the targets (m/s)
 SPEEDS = {"at rest": (0.0, 0.0), "P1": (0.0, 10.0), "P2": (10.0, 0.0), "P3": (10.0, 5.0), "P4": (5.0, 10.0)}

@@ -282,7 +282,8 @@ def _picture(factor: float) -> Callable[[_Seen, Path], list[Check]]:
         shown, lines = {}, {}
         for title, one in ((BEGINNINGS[factor], factor), ("recommended", None)):
             image = _compensated(seen, one)
-            half = -0.25 * image.axes[0].start  # a quarter of the band
+            # half of the drawn Doppler interval: a quarter of the band
+            half = -0.25 * image.axes[0].start
             shown[title] = plot.within(image, {"Doppler": (-half, half)})
             shown[f"{title}, part"] = plot.within(image, {"Doppler": (PART[0] * half, PART[1] * half)})
             range_m = image.axis("range")

@@ -216,7 +216,8 @@ def sweep_grid(loaded: Loaded, trial: SweepTrial) -> Grid:
     grid = make_grid(given, [key for key in given if trial.may_differ(key)], f"{file}: sweep")
     for parameter in grid.parameters:
         ends = {*parameter.values[:1], min(parameter.values), max(parameter.values)} if parameter.batched else ()
-        for value in ends:  # numbers between two accepted values are accepted too
+        # the ends of a range are tested, because all numbers between two accepted ones are accepted
+        for value in ends:
             Bench(loaded.changed({parameter.name: value}), trial.device)
     for case in grid.cases():
         there = {stage for chain in trial.bench(case.fixed).chains.values() for stage in chain.stages}

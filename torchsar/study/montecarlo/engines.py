@@ -213,7 +213,7 @@ def _local(distributed: Any, workers: int, threads: int) -> Iterator[Engine]:
         )
         | {"OMP_WAIT_POLICY": "PASSIVE"},
         "distributed.scheduler.allowed-failures": _DEATHS,
-        # the servers of pages, which dask always starts, have none
+        # dask always starts its web servers; without routes they serve no pages
         "distributed.scheduler.http.routes": [],
         "distributed.worker.http.routes": [],
     }

@@ -30,7 +30,7 @@ from torch import Tensor, nn
 
 from torchsar.study.settings.errors import ConfigError
 
-# longer descriptions of values are replaced by a digest
+# largest number of characters in a description of a value; a longer one is replaced by a digest
 _SHOWN = 40
 _PLAIN = (type(None), bool, int, float, complex, str, bytes, type(Ellipsis))
 # kinds of objects of which only the members that the code names are described
@@ -179,10 +179,11 @@ class _Reader:
             return sorted(value.items(), key=self.text)
         if isinstance(value, (staticmethod, classmethod, property, cached_property)):
             return [getattr(value, name, None) for name in ("__func__", "fget", "fset", "func")]
-        # slots, and attributes of classes that are written in C
+        # slots and other attributes implemented in C are described by their names
         if isinstance(value, (GetSetDescriptorType, MemberDescriptorType)):
             return (value.__qualname__,)
-        # these functions take precedence, as in pickle
+        # functions registered with copyreg take precedence over the method of the object, as in
+        # pickle
         pickler = copyreg.dispatch_table.get(type(value))
         reduced = pickler(value) if pickler else value.__reduce_ex__(4)
         pickled = [reduced] if isinstance(reduced, str) else reduced

@@ -113,7 +113,7 @@ def echo_choices(bench: Bench) -> list[Choice]:
         point = replace(
             world, scene={"edge": Points([edge[0]], [edge[1]])}, noise=Noise(), start_phase=(), impairments={}
         )
-        # compression removes the velocity of the track that the receiver follows
+        # compression removes the mean velocity of the range that the receiver tracks
         compress = CompressDechirped(
             radar,
             velocity_m_s=sum(m.coefficients_m[0] for m in own.track) if own.track else None,  # pyright: ignore

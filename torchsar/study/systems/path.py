@@ -413,7 +413,8 @@ class AnyPath(System):
         antenna = (None, None)
         if lit is not None:
             numbers = (float(torch.as_tensor(v).mean()) for v in (lit.width_deg, lit.squint_deg))
-            with suppress(ValueError):  # a beam that reaches the track has no band
+            # ProcessedBeam raises ValueError for a beam that reaches the direction of the track
+            with suppress(ValueError):
                 antenna = lit.mean_power, ProcessedBeam(*numbers)
         return by_limit(
             (at, name)
@@ -442,7 +443,7 @@ class AnyPath(System):
         )
         antennas, grid = AntennaPath.recorded(clean.aux), stage.grid
         geometry = (clean.aux["frequency_hz"], antennas.transmitter_m, antennas.receiver_m, antennas.reference_m)
-        # tiles sum the pulses that the recommended method uses
+        # the tile plans sum the same pulses as the recommended method
         seen = stage.lit(antennas), stage.weight(antennas)
         tiles = possible_plans(lambda error: TilePlan(*geometry, grid, error, *seen), (-20.0, -40.0, -60.0, -80.0))
         alternatives = [

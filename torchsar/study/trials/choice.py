@@ -434,7 +434,8 @@ def points_at_rest(
     lines, cells = stationary_axis(radar, axes[1], stage.rebuild.bands), axes[2]
     reach = max(0.0, size[0] / radar.prf_hz - lit_s) / 2 * radar.speed_m_s
     rows = slice(*(round(float(lines.index_of(y))) + more for y, more in ((-reach, 0), (reach, 1))))
-    columns = slice(cells.n // 4, 3 * cells.n // 4)  # the margins contain the migration
+    # a quarter of the cells is left out on each side, because range migration extends into it
+    columns = slice(cells.n // 4, 3 * cells.n // 4)
     along, closest = lines.values()[rows], cells.values()[columns] - radar.reference_range_m
     pixels = torch.cartesian_prod(along, closest, along.new_zeros(1))[:, [1, 0, 2]]
     some = some_pixels(draws, len(pixels))
@@ -489,7 +490,7 @@ def points_of_a_strip(
     index = [axis.index_of(x).round().long().clamp(0, axis.n - 1) for axis, x in zip(axes, positions, strict=True)]
     along, slant = (axis.values()[i] for axis, i in zip(axes, index, strict=True))
     sine = radar.sin_squint(frame, velocity_m_s)
-    # the chosen line of sight crosses a point before broadside does
+    # azimuth at which the chosen line of sight crosses the point, which is before broadside
     along = velocity_m_s * along / radar.velocity_m_s + sine * slant
     compressed = torch.fft.fft(raw.data) * REFERENCES["matched"](radar.pulse, n, radar.sampling_hz)
     cell, near = torch.arange(n, dtype=torch.float64) - n // 2, raw.axes[1].start

@@ -314,7 +314,7 @@ def _dimensions(bench: Bench) -> Measured:
     """Measure the response of the fastest target with azimuth-only data, range-compressed lines and
     full chirps.
     """
-    # echoes begin in the middle of the axis
+    # lines of full echoes are longer, because an echo begins in the middle of the axis
     longer = _LINES + 2 * bench.radar.pulse.n_samples(bench.radar.sampling_hz)
     sizes: tuple[dict[str, Any], ...] = ({}, {"samples": _LINES}, {"samples": longer, "kind": "full"})
     crop = _cropped(bench)

@@ -31,7 +31,8 @@ from torchsar.study.trials.system import Noise
 _CONCERNS = {
     "SNR after compression": ("segmented_interference", "unwrap", "gradient"),
     "spacing of scatterers": ("segmented_interference", "bins", "peak"),
-    "speed of the mirror tone": ("", "", ""),  # estimators remove most of the velocity first
+    # no stage, because estimators remove most of the velocity first
+    "speed of the mirror tone": ("", "", ""),
 }
 # echo models, the cheapest first: level of detail, effect that is left out, row of the requirements
 _MODELS = (
@@ -113,7 +114,7 @@ def choices(bench: Bench) -> list[Choice]:
         "radial motion": radial_motion,
     }
     found = [Alternative(name, {"estimator": work}) for name, work in estimators.items()]
-    # in a continuous record, a sweep has no single range
+    # models with one range per sweep are not possible for a continuous record
     possible = [entry for entry in _MODELS if bench.world().record is None or not entry[0].startswith("one_per")]
     seen = _moved(bench)
     models = [_model(bench, seen, *entry) for entry in possible]
@@ -145,7 +146,7 @@ def _echoes(bench: Bench, seen: Moved) -> Measured:
     """
     world, nothing = bench.world(), {"impairments": {}, "record": None, "sweep_error": None, "log_amplitude": None}
     alone = replace(world, scene={"edge": seen.farthest}, noise=Noise(), **nothing)
-    draws = bench.draws("run", [0])  # draws of the trial whose motion is predicted
+    draws = bench.draws("run", [0])  # random draws of the trial for which the predictions are made
 
     def made(of: Any, keys: Mapping[str, Any], dtype: torch.dtype) -> Tensor:
         trials = replace(of, fidelity=_fidelity(keys)).trials_of(bench.radar, draws, dtype)

@@ -167,7 +167,7 @@ def course_of(chain: Chain, trace: Trace, truth: Mapping[str, Tensor], radar: Tr
         per_m = 4 * math.pi / radar.wavelength_m
         error = _unwrapped(coarse * per_m + phase) / per_m
     shines = leading(truth["amplitude"].abs())
-    # other scatterers are never in the beam
+    # scatterers that are not among the strongest are treated as never lit
     azimuth = torch.where(shines, truth["azimuth_m"], math.inf)
     lit = lit_periods(radar, pulse, azimuth, truth["range_m"].expand(azimuth.shape)).expand(error.shape)
     return Course(pulse, velocity, None if velocity is None else velocity - true, error, coarse, lit)

@@ -230,7 +230,8 @@ class Stripmap(System):
     reads = "raw stripmap"
     ending = "a focusing stage"
     truths = ("doppler_hz", "velocity_m_s")
-    # the address has no batch, so that the results of earlier versions are reproduced
+    # random numbers are addressed without the batch, so that results of earlier versions are
+    # reproduced
     address = 0
     peak = 2.0
     tolerance = {"image_error_db": -20.0, "echo_error_db": -20.0, "data_error_db": -20.0}
