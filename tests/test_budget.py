@@ -73,7 +73,6 @@ def ideas() -> set[str]:
     return {name.replace("_", "").lower() for face in faces for name in face.__all__}
 
 
-@pytest.mark.slow
 def test_every_room_keeps_its_number_of_statements() -> None:
     found = statements()
     assert set(found) == set(BUDGET["statements"])

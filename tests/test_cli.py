@@ -35,6 +35,9 @@ def spoken(capsys: pytest.CaptureFixture[str]) -> list[str]:
 
 def test_list_explains_experiments_systems_stages_keys_and_data(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["list"]) == 0
+    brief = capsys.readouterr().out
+    assert len(brief.splitlines()) < 130 and "doppler_centroid" in brief and "torchsar list --all" in brief
+    assert main(["list", "--all"]) == 0
     text = capsys.readouterr().out
     for name in ("stripmap_damaged", "radarsat1", "omega_k", "doppler_centroid", "points", "dwell", "chirp_rate_hz_s"):
         assert name in text

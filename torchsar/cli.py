@@ -104,6 +104,7 @@ def parser() -> argparse.ArgumentParser:
         commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
     words = "only entries that contain all these words, such as `torchsar list stripmap prf_hz`"
     commands.choices["list"].add_argument("words", nargs="*", metavar="WORD", help=words)
+    commands.choices["list"].add_argument("--all", action="store_true", help="all entries with all their keys")
     one = commands.choices["config"]
     one.add_argument("what", choices=("show", "schema"), help="a packaged config, or the schema of all configs")
     chosen = one.add_argument("config", nargs="?", help="name of the packaged config (see `torchsar list`)")
@@ -297,9 +298,10 @@ def _print(options: argparse.Namespace) -> int:
     from torchsar.study.table import systems
 
     if options.command == "list":
-        from torchsar.study.commands.listing import listing
+        from torchsar.study.commands.listing import listing, overview
 
-        others = entries_with(options.words, listing(systems))
+        brief = not options.words and not options.all
+        others = overview(systems) if brief else entries_with(options.words, listing(systems))
         if not names and not others:
             raise ConfigError(f"no entry of `torchsar list` contains {' and '.join(map(repr, options.words))}")
         print(others, end="\n" if others else "")

@@ -5,11 +5,14 @@ from __future__ import annotations
 from html.parser import HTMLParser
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
 
 import torchsar
+from tests.helpers import small_radar
+from torchsar import compensate, focus, scene
 from torchsar.core import Axis, Estimate, Outcome, Recording, Signal, Stage, Truth, use
 from torchsar.core.show import in_bytes, some_of
 
@@ -184,3 +187,45 @@ def test_the_record_of_a_sweep_shows_its_axes_and_metrics() -> None:
     shown = "Record(6 of 6 trials done; algorithm: 1, mean; snr_db: 2, 0, 10; trial: 3; error_m)"
     assert repr(record) == shown
     assert "snr_db" in Checked(record._repr_html_()).words
+
+
+def test_a_signal_behaves_like_an_array_where_that_has_one_meaning() -> None:
+    x = signal(3)
+    x.data[1] = 2j
+    assert x.shape == (3, 4, 1000) and float(abs(x).sum()) == 8000
+    assert np.asarray(x).dtype == np.complex64 and np.array_equal(x.numpy(), np.asarray(x))
+    assert x[1].trials == () and torch.equal(x[1].data, x.data[1]) and x[1:].trials == (2,) and x[1].axes == x.axes
+    assert [float(abs(one).max()) for one in x] == [0, 2, 0]
+    for wrong in (lambda: x[0, 1], lambda: x[0][0], lambda: list(x[0]), lambda: x[..., 0]):
+        with pytest.raises(IndexError, match=r"chooses trials, .* trial dimensions \(3?,?\); .*isel\(pulse=0\)"):
+            wrong()
+
+
+def test_stages_show_the_arguments_given_to_them() -> None:
+    assert repr(compensate.Pga(iterations=3, assess=False)) == "Pga(iterations=3, assess=False)"
+    assert repr(focus.OmegaK(small_radar(), velocity_m_s=120.0)) == "OmegaK(radar=StripmapRadar, velocity_m_s=120)"
+    assert repr(Gain()) == "Gain()"
+
+
+def test_a_recording_in_place_of_its_signal_gets_a_hint() -> None:
+    with pytest.raises(TypeError, match=r"got Recording; pass its signal: recording\.signal"):
+        compensate.Sca()(Recording(signal(3), Gain(), {}))
+
+
+def test_scenes_and_radars_show_tensors_by_their_kind() -> None:
+    shown = repr(scene.Points(azimuth_m=torch.arange(100.0), range_m=torch.zeros(100)))
+    assert shown.startswith("Points(azimuth_m=float32 (100,), range_m=float32 (100,), amplitude=")
+    assert "carrier_hz=" in repr(small_radar())
+
+
+def test_plain_modules_get_samples_and_those_that_say_so_the_signal() -> None:
+    class Double(nn.Module):
+        def forward(self, x, gain=2.0):
+            return x * gain
+
+    x = signal(2)
+    x.data[:] = 1
+    assert torch.equal(torchsar.Chain(a=Double(), b=nn.Identity())(x).data, 2 * x.data)
+    assert torchsar.Chain(gain=Gain(), louder=use(Amplify(), gain_db="gain"))(x).shape == x.shape
+    with pytest.raises(ValueError, match=r"stage 'a' \(Flatten\) made \(2, 4000\) of samples \(2, 4, 1000\)"):
+        torchsar.Chain(a=nn.Flatten())(x)

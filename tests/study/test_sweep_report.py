@@ -13,10 +13,12 @@ import numpy as np
 import pytest
 
 from tests.study.scenes import draw_first_panels
-from torchsar.core import Outcome
+from torchsar.core import Draws, Outcome
 from torchsar.plot import axis_label
+from torchsar.study.montecarlo import sweep
 from torchsar.study.montecarlo.record import Record, Summary, summary_of
 from torchsar.study.montecarlo.report import SweepPictures, draw_sweep, with_interval, write_sweep_report
+from torchsar.study.montecarlo.work import BOUNDS
 from torchsar.study.output.numbers import number, write_json
 from torchsar.study.output.report import Picture
 
@@ -371,3 +373,25 @@ def test_report_says_where_it_was_made(page: str) -> None:
 
 def test_intervals_stand_in_brackets_where_there_is_one() -> None:
     assert with_interval(2.0, [None, None]) == "2" and with_interval(2.0, [1.5, 2.5]) == "2 [1.500, 2.500]"
+
+
+def test_a_record_of_a_script_draws_itself_and_has_a_table(tmp_path: Path) -> None:
+    """The figure is that of a report; the table has the statistics of each point."""
+
+    def trial(parameters: Any, draws: Draws) -> Any:
+        error = draws.normal("noise", (1,))[:, 0] * 10 ** (-parameters["snr_db"] / 20)
+        return {"a": {"error_m": error}, "b": {"error_m": 2 * error}, BOUNDS: {"error_m": {"limit": error * 0 + 0.1}}}
+
+    record = sweep(trial, {"snr_db": [0.0, 20.0]}, batched=["snr_db"], trials=50)
+    (figure,) = record.plot("error_m")
+    axes = figure.axes[0]
+    assert {line.get_label() for line in axes.lines} >= {"a", "b"} and axes.get_yscale() == "log"
+    with pytest.raises(KeyError, match=r"finite numbers of this record are \['error_m'\], got 'error'"):
+        record.plot("error")
+    first = record.table()[0]
+    assert first["rmse"] == pytest.approx(np.sqrt((record.metrics["error_m"][0, 0] ** 2).mean()))
+    record.to_csv(tmp_path / "table.csv")
+    lines = (tmp_path / "table.csv").read_text().splitlines()
+    assert lines[0].startswith("metric,algorithm,snr_db,n,trials,rmse") and len(lines) == 5
+    with pytest.raises(FileExistsError):
+        record.to_csv(tmp_path / "table.csv")

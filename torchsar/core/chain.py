@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchsar.core.connect import Use
+from torchsar.core.connect import Use, run_module
 from torchsar.core.draws import Draws
 from torchsar.core.estimate import Estimate
 from torchsar.core.host import gathered_checks
@@ -198,6 +198,10 @@ class Chain(Shown, nn.Module):
     the trace holds before `start`, and it is differentiable, so that it can serve as the objective
     of a minimum-entropy search. A stage that returns only an Estimate leaves the signal unchanged.
     Connections made by `use` are checked when the chain is built.
+
+    Modules that are no stages of torchsar work too, such as a torch.nn.Sequential: they get the
+    samples as a tensor and return samples of the same shape. If the first parameter of `forward` is
+    annotated with `Signal`, they get the signal as stages do.
 
     A chain may begin with the world and end with numbers: `echo.Simulate` makes the recording, so
     that the chain is called with random draws in its place (`chain(draws=Draws(1))`);
@@ -502,8 +506,8 @@ class Chain(Shown, nn.Module):
             recording, truth = stage(before, draws, **arguments)
             known.take_over(recording, truth, "" if signal is None else f"{name}.")
             return recording.signal
-        result = stage(signal, **arguments)
         assert signal is not None
+        result = run_module(name, stage, signal, arguments)
         if isinstance(result, Mapping):
             known.metrics |= {f"{name}.{key}" if key else name: value for key, value in result.items()}
             return signal

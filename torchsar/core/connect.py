@@ -1,10 +1,15 @@
-"""Connections between parameters of stages and values of earlier stages."""
+"""Connections of parameters of stages to values of earlier stages, and the call of a module."""
 
 from __future__ import annotations
 
+import functools
+import inspect
 from collections.abc import Mapping
+from typing import Any
 
-from torch import nn
+from torch import Tensor, nn
+
+from torchsar.core.signal import Signal
 
 
 class Use(nn.Module):
@@ -75,3 +80,41 @@ def use(stage: nn.Module, *, in_doubt: str = "apply", **names: str) -> Use:
             )
     sources = {key: source if "." in source else f"{source}.{key}" for key, source in names.items()}
     return Use(stage, sources, in_doubt)
+
+
+def run_module(name: str, stage: nn.Module, signal: Signal, arguments: Mapping[str, Tensor]) -> Any:
+    """Run a stage on a signal, or a module that is no stage on its samples.
+
+    Args:
+        name: Name of the stage in the chain.
+        stage: The module. Unless it belongs to torchsar, or the first parameter of its `forward` is
+            annotated with `Signal`, it gets samples and returns samples.
+        signal: Signal before the stage.
+        arguments: Further values by the names of parameters.
+
+    Returns:
+        What the module returns; samples become a signal on the axes of `signal`.
+
+    Raises:
+        ValueError: If samples have another shape than those of the signal.
+    """
+    if not _takes_samples(type(stage)):
+        return stage(signal, **arguments)
+    result = stage(signal.data, **arguments)
+    if not isinstance(result, Tensor):
+        return result
+    if result.shape != signal.shape:
+        raise ValueError(
+            f"stage {name!r} ({type(stage).__name__}) made {tuple(result.shape)} of samples {tuple(signal.shape)}; a "
+            "module that is no Stage returns samples of the same shape, or else a Signal with axes of its own"
+        )
+    return signal.with_data(result)
+
+
+@functools.cache
+def _takes_samples(kind: type[nn.Module]) -> bool:
+    """Whether modules of this class get samples: those that are neither stages nor say `Signal`."""
+    if any(base.__module__.startswith("torchsar.") for base in kind.__mro__):
+        return False
+    first = list(inspect.signature(kind.forward).parameters.values())[1:2]
+    return not any("Signal" in str(parameter.annotation) for parameter in first)

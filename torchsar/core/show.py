@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass
 from html import escape
+from typing import Any
 
 from torch import Tensor
 
@@ -92,6 +93,35 @@ def content(x: object) -> str:
         return f"{x:.6g}" if isinstance(x, float) else type(x).__name__
     number = one_number(x) if x.numel() == 1 else None
     return kind_of(x) if number is None else f"{number:.6g}"
+
+
+def argument(x: object) -> str:
+    """Return an argument of a call as words: itself if it is short and plain, otherwise its kind.
+
+    Args:
+        x: Any object.
+
+    Returns:
+        Words such as "3", "'hann'" or "float64 (4,)".
+    """
+    plain = isinstance(x, (bool, int, str, bytes, tuple, list, dict)) or x is None
+    return repr(x) if plain and len(repr(x)) <= 40 else content(x)
+
+
+def show_briefly(members: Iterable[object]) -> None:
+    """Let objects of the dataclasses of a package show their tensors by dtype and shape.
+
+    Args:
+        members: Members of a package; those that are no dataclasses are left as they are.
+    """
+
+    def brief(self: Any) -> str:
+        named = ", ".join(f"{one.name}={argument(getattr(self, one.name))}" for one in fields(self) if one.repr)
+        return f"{type(self).__name__}({named})"
+
+    for one in members:
+        if isinstance(one, type) and is_dataclass(one) and one.__repr__ is not Shown.__repr__:
+            one.__repr__ = brief
 
 
 def one_number(x: Tensor) -> complex | None:

@@ -7,10 +7,11 @@ from __future__ import annotations
 import importlib
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -189,6 +190,40 @@ class Signal(Shown):
             )
 
     @property
+    def shape(self) -> torch.Size:
+        """Shape of the samples, trials first."""
+        return self.data.shape
+
+    def __abs__(self) -> Tensor:
+        """Amplitudes of the samples, a tensor."""
+        return self.data.abs()
+
+    def __getitem__(self, index: Any) -> Signal:
+        """Choose trials, as `signal[0]` or `signal[:, 2:5]`; `isel` and `sel` choose samples.
+
+        Raises:
+            IndexError: If the signal has fewer trial dimensions, or fewer trials.
+        """
+        count = sum(i is not None for i in index) if isinstance(index, tuple) else 1
+        if count > len(self.trials) or (isinstance(index, tuple) and Ellipsis in index):
+            raise IndexError(
+                f"signal[...] chooses trials, and this signal has the trial dimensions {tuple(self.trials)}; choose "
+                f"samples with signal.isel({self.names[0]}=0) or signal.sel({self.names[0]}=...)"
+            )
+        return self.with_data(self.data[index])
+
+    def __iter__(self) -> Iterator[Signal]:
+        """Signals of the trials of the first dimension."""
+        return map(self.__getitem__, range(self.trials[0] if self.trials else 1))
+
+    def numpy(self) -> np.ndarray:
+        """Return the samples as an array on the CPU, without gradient."""
+        return self.data.numpy(force=True)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.array(self.numpy(), dtype=dtype, copy=copy)
+
+    @property
     def trials(self) -> torch.Size:
         """Shape of the leading trial dimensions."""
         return self.data.shape[: self.data.ndim - len(self.axes)]
@@ -316,8 +351,7 @@ class Signal(Shown):
         count = len(self.trials)
         trials = ("trial",) if count == 1 else tuple(f"trial_{i}" for i in range(count))
         coordinates = {a.name: (a.name, a.values().numpy(), {"units": a.unit}) for a in self.axes}
-        data = torch.resolve_neg(self.data.detach().cpu().resolve_conj()).numpy()
-        return xarray.DataArray(data, coordinates, (*trials, *self.names))
+        return xarray.DataArray(self.numpy(), coordinates, (*trials, *self.names))
 
     def to(self, *args: Any, **kwargs: Any) -> Signal:
         """Return the signal on another device or in another dtype; arguments as for Tensor.to."""

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torchsar.core.derivatives import Differentiable, without_derivatives
 from torchsar.core.estimate import Estimate
 from torchsar.core.host import checked_samples, gathered_checks, refuse_non_finite_values
+from torchsar.core.show import argument
 from torchsar.core.signal import Signal
 
 
@@ -93,9 +94,14 @@ class Stage(nn.Module):
         """Check the arguments of a call and run `forward`."""
         name = type(self).__name__
         if not isinstance(signal, Signal):
+            whole = hasattr(signal, "signal")
+            hint = (
+                "pass its signal: recording.signal"
+                if whole
+                else ("wrap the tensor: Signal(data, radar.raw_axes(lines, samples))")
+            )
             raise TypeError(
-                f"{name} works on a Signal with the axes {self.works_on}, got "
-                f"{type(signal).__name__}; wrap the tensor: Signal(data, radar.raw_axes(lines, samples))"
+                f"{name} works on a Signal with the axes {self.works_on}, got {type(signal).__name__}; {hint}"
             )
         if signal.names not in (self.works_on, *self.also_on):
             raise ValueError(
@@ -120,6 +126,9 @@ class Stage(nn.Module):
         neutral = {**numbers, **known, **estimate.neutral}
         return replace(estimate, neutral={key: neutral[key] for key in estimate.value if key in neutral})
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({vars(self).get('_given', '')})"
+
     def hold(self, name: str, value: Tensor | float) -> None:
         """Register a value of the stage as its attribute, tunable or constant.
 
@@ -136,7 +145,7 @@ class Stage(nn.Module):
 
 def _explained(init: Callable[..., None]) -> Callable[..., None]:
     """Wrap the constructor of a stage so that its errors have a note with parameters and
-    arguments.
+    arguments, and that its representation shows the arguments.
     """
 
     @functools.wraps(init)
@@ -149,5 +158,9 @@ def _explained(init: Callable[..., None]) -> Callable[..., None]:
                 given = textwrap.shorten(f"{args} and {kwargs}", 200)
                 error.add_note(f"{type(self).__name__}{inspect.signature(type(self))} was given {given}")
             raise
+        if type(self).__init__ is explained:
+            names = list(inspect.signature(type(self)).parameters)
+            given = {**dict(zip(names, args)), **kwargs}
+            self._given = ", ".join(f"{name}={argument(value)}" for name, value in given.items())
 
     return explained

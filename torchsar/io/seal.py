@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +79,8 @@ def canonical(tree: Any) -> str:
     """Return a text that is equal for equal content: keys are sorted, and 20 and 20.0 are alike.
 
     Args:
-        tree: Plain values, or mappings and sequences of them; other objects count by their repr().
+        tree: Plain values, or mappings and sequences of them; dataclasses count by
+            their fields, and other objects by their repr().
 
     Returns:
         The text, in JSON.
@@ -96,6 +98,8 @@ def _plain(x: Any) -> Any:
         return x
     if isinstance(x, (int, float)):
         return float(x) + 0.0  # the addition turns -0.0 into 0.0, which is an equal number
+    if is_dataclass(x):
+        return {"": type(x).__qualname__} | {one.name: _plain(getattr(x, one.name)) for one in fields(x)}
     return _plain(x.tolist()) if hasattr(x, "tolist") else repr(x)
 
 

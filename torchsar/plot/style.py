@@ -176,19 +176,29 @@ def legend_below(figure: Figure, axes: Axes, least: int = 2) -> None:
     figure.legend(handles, names, loc="outside lower center", ncols=columns)
 
 
-def save(figure: Figure | Sequence[Figure], path: Any, dpi: int = 120, columns: int = 2) -> None:
+def save(
+    figure: Figure | Sequence[Figure], path: Any, dpi: int = 120, columns: int = 2, width_in: float | None = None
+) -> None:
     """Write one figure, or several figures as one picture, to a file.
+
+    PDF and SVG hold text as text, in fonts that publishers accept (TrueType).
 
     Args:
         figure: Figure to write, or several, which are set side by side, row by row.
         path: Path of the file, whose suffix gives the format, or a binary file for PNG.
         dpi: Resolution in dots per inch.
         columns: Number of panels in a row.
+        width_in: Width of a figure in inches, such as 3.5 for one column of a journal and 7.16 for
+            two; the height follows, and text keeps its size. None for the width of the figure.
     """
     kind = "png" if not isinstance(path, str | PathLike) or str(path).endswith(".png") else None
     figures = [figure] if isinstance(figure, Figure) else figure
+    for one in figures:
+        if width_in is not None:
+            one.set_size_inches(width_in, one.get_figheight() * width_in / one.get_figwidth())
     if len(figures) == 1 and kind is None:
-        figures[0].savefig(path, dpi=dpi)  # in vector graphics if the file format has them
+        with rc_context({"pdf.fonttype": 42, "ps.fonttype": 42, "svg.fonttype": "none"}):
+            figures[0].savefig(path, dpi=dpi)  # in vector graphics if the file format has them
         return
     # pixels are drawn here because savefig would draw a figure with a layout twice
     drawn = [_pixels(one, dpi) for one in figures]

@@ -23,6 +23,7 @@ speed of light                         `LIGHT_M_S`
 =====================================  ============================================================
 """
 
+from torchsar.core.show import show_briefly
 from torchsar.radar.antenna_path import AntennaPath
 from torchsar.radar.bistatic import BistaticRadar
 from torchsar.radar.instrument import LIGHT_M_S
@@ -72,3 +73,4 @@ __all__ = [
     "timing_diagram",
 ]
 __dir__ = __all__.copy
+show_briefly(globals()[name] for name in __all__)

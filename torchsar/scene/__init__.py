@@ -37,6 +37,7 @@ A parameter annotated `Tensor | float` is a number, equal in all trials, or a te
 because they decide shapes or choose a model.
 """
 
+from torchsar.core.show import show_briefly
 from torchsar.scene.aircraft import Aircraft, SpreadRows
 from torchsar.scene.bistatic import (
     BandLimited,
@@ -138,3 +139,4 @@ __all__ = [
     "VibrationSpectrum",
 ]
 __dir__ = __all__.copy
+show_briefly(globals()[name] for name in __all__)

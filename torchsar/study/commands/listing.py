@@ -43,6 +43,19 @@ def listing(systems: Mapping[str, System]) -> str:
     return "\n".join(lines)
 
 
+def overview(systems: Mapping[str, System]) -> str:
+    """Return the names of all systems, stages and parts of simulated worlds, without their keys."""
+    lines = ["", "SYSTEMS", *(f"  {name:<24} {system.about}" for name, system in systems.items()), ""]
+    named = {f"STAGES, {group}": [s for s in stages().entries if group_of(s) == group] for group in (*GROUPS, "own")}
+    named |= {title: list(catalogue.entries) for title, catalogue in WORLD.items()}
+    for title, names in named.items():
+        text = f"{title}: {', '.join(names)}"
+        lines += textwrap.wrap(text, 118, subsequent_indent="  ") if names else []
+    return "\n".join(
+        [*lines, "", "`torchsar list NAME` explains one of these with its keys, `torchsar list --all` every one."]
+    )
+
+
 def _entries(catalogue: Catalogue, names: Any) -> list[str]:
     lines = []
     for name in names:

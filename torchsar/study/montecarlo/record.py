@@ -4,9 +4,11 @@ statistics, which reports show and summary.json contains.
 
 from __future__ import annotations
 
+import csv
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -186,6 +188,48 @@ class Record(show.Shown):
             {"done": (self.dims[1:], self.done), OK: (self.dims, self.ok, {"kind": OK}), **arrays},
             {name: list(values) for name, values in coordinates.items()},
         )
+
+    def plot(self, metric: str) -> Any:
+        """Draw a metric over the parameters, with its intervals and bounds, as reports do.
+
+        Args:
+            metric: Name of the metric. Of an error its RMSE is drawn, otherwise its median.
+
+        Returns:
+            Figures over the first parameter with several numbers, one for each value of the other
+            parameters; a notebook shows them, and `torchsar.plot.save` writes them.
+
+        Raises:
+            KeyError: If the record has no such metric, or no finite number of it.
+        """
+        from torchsar.study.montecarlo.report import SweepPictures, main_quantity
+
+        finite = [name for name, values in self.metrics.items() if np.isfinite(values).any()]
+        if metric not in finite:
+            raise KeyError(f"the metrics with finite numbers of this record are {finite}, got {metric!r}")
+        pictures = SweepPictures(summary_of(self, {}))
+        return next(pictures.curves(main_quantity(metric, bool(self.bounds.get(metric)))))[-1]
+
+    def table(self) -> list[dict[str, Any]]:
+        """Return the statistics of each metric, algorithm and point: rows of values by column."""
+        points = summary_of(self, {}).tree({"title": "", **self.about}, {})["points"]
+        columns = ("n", "trials", "rmse", "median", "mean", "std", "ok_share")
+        return [
+            {"metric": p["metric"], "algorithm": p["algorithm"], **p["parameters"], **{c: p[c] for c in columns}}
+            for p in points
+        ]
+
+    def to_csv(self, path: Path | str) -> None:
+        """Write the rows of `table` to a new file of comma-separated values.
+
+        Raises:
+            FileExistsError: If the file exists.
+        """
+        rows = self.table()
+        with open(path, "x", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, list(rows[0]) if rows else [])
+            writer.writeheader()
+            writer.writerows(rows)
 
     def _summary(self) -> show.Summary:
         axes = {"algorithm": self.algorithms, **self.labels}.items()
