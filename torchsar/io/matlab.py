@@ -32,7 +32,7 @@ _PLACE = re.compile(r"([^()]*)(?:\((\d+)\))?.*", re.DOTALL)
 
 
 class _Matrix(NamedTuple):
-    """Header of an array, and the elements that follow it: name, class with flags, and shape."""
+    """Header of an array (name, class with flags, shape) and the elements that follow it."""
 
     name: str
     flags: int

@@ -103,7 +103,7 @@ def write_sicd(
 
 @dataclass(frozen=True)
 class _Pixels:
-    """Pixels whose rows, columns and up are right-handed.
+    """Pixels in an order in which the directions of rows, of columns and up are right-handed.
 
     Args:
         corner_m: Position of the first pixel.

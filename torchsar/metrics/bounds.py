@@ -228,7 +228,8 @@ def pulse_phase_bound_of_scene_rad(azimuth: Tensor, range_: Tensor, amplitude: T
     """
     echo = (azimuth * amplitude[..., None, :]) @ range_
     gram = (azimuth.mH @ azimuth) * (range_ @ range_.mH).mT
-    # A^H times the derivative by each phase, without its factor j, (..., pulse, target)
+    # A^H times the derivative with respect to each phase, without its factor j;
+    # shape (..., pulse, target)
     cross = azimuth.conj() * (echo @ range_.mH)
     scale = gram.diagonal(dim1=-2, dim2=-1).real.mean(-1)[..., None, None]
     ridge = 1e-9 * scale * torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
