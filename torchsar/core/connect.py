@@ -113,7 +113,7 @@ def run_module(name: str, stage: nn.Module, signal: Signal, arguments: Mapping[s
 
 @functools.cache
 def _takes_samples(kind: type[nn.Module]) -> bool:
-    """Whether modules of this class get samples: those that are neither stages nor say `Signal`."""
+    """True if modules of this class get samples instead of a signal; see `run_module`."""
     if any(base.__module__.startswith("torchsar.") for base in kind.__mro__):
         return False
     first = list(inspect.signature(kind.forward).parameters.values())[1:2]

@@ -1,4 +1,4 @@
-"""What stages and functions say of their derivatives, and the warning of those that have none."""
+"""Declarations of the derivatives that functions have, and a warning of missing derivatives."""
 
 from __future__ import annotations
 
@@ -18,14 +18,16 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 class DerivativeWarning(UserWarning):
-    """A derivative is asked for that a stage or function does not have; its results are constants.
+    """Warning that a stage or function has no derivatives although a derivative is requested.
+
+    Its results are constants.
 
     >>> import warnings, torch
     >>> from torchsar.core import DerivativeWarning
     >>> from torchsar.compensate import align_envelopes
     >>> pulses = torch.ones(4, 8, dtype=torch.complex64, requires_grad=True)
     >>> with warnings.catch_warnings(record=True) as shown:
-    ...     warnings.simplefilter("always")  # "error" makes an error of it
+    ...     warnings.simplefilter("always")  # "error" raises an error instead
     ...     found = align_envelopes(pulses)
     >>> shown[0].category.__name__
     'DerivativeWarning'
@@ -63,7 +65,7 @@ def differentiable(kind: Differentiable) -> Callable[[Function], Function]:
 
 @contextmanager
 def without_derivatives(name: str, given: Any) -> Iterator[Any]:
-    """Within the block, compute with constants, and warn if a derivative is asked for.
+    """Within the block, compute with constants, and warn if a derivative is requested.
 
     Args:
         name: Name of the stage or function for the warning.
@@ -85,13 +87,13 @@ def without_derivatives(name: str, given: Any) -> Iterator[Any]:
 
 
 def is_differentiated(*given: Any) -> bool:
-    """Find out whether a derivative by one of these tensors is asked for, in either mode.
+    """Find out whether a derivative with respect to one of these tensors is requested.
 
     Args:
         given: Trees of tensors, such as signals, and objects with tensors as attributes.
 
     Returns:
-        True if a tensor requires a gradient or has a tangent.
+        True if a tensor requires a gradient (reverse mode) or has a tangent (forward mode).
     """
     leaves = [part for x in pytree.tree_leaves(given) for part in (x, *getattr(x, "__dict__", {}).values())]
     tensors = [x for x in leaves if isinstance(x, Tensor)]

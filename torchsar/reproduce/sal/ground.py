@@ -58,7 +58,7 @@ MOTION = (
     Sinusoid(100e-6, 47.0, 63.03),
     Sinusoid(3e-6, 180.0, 114.59),
 )
-# settings in which the segmented method is compared: strength of the air, and SNR (dB)
+# settings in which the segmented method is compared: strength of turbulent air, and SNR (dB)
 AIR = {"still": (0.0, 0.0), "half": (0.5, 0.0), "double": (2.0, 0.0), "calm": (0.0, 20.0)}
 TRIGGER_S, BLOCK_S = 5.3e-6, 40e-6
 RETRO_M, RETRO, SCENE_M = 10.5, (10.0, 11.3), (9.8, 11.8)
@@ -107,7 +107,8 @@ def _one(
 ) -> tuple[Recording, Truth, dict[str, Trace], dict[str, Course], dict[str, dict[str, float]]]:
     """Simulate and process one draw by all methods or by `only` one of them.
 
-    Air of the strength 1 changes the path by 1.5 um rms, and the logarithm of the amplitude by 0.1.
+    Turbulent air of the strength 1 changes the path by 1.5 um rms, and the logarithm of the
+    amplitude by 0.1 rms.
     The reduced form has every 24th period.
     """
     radar = replace(RADAR, keep_every=24) if small else RADAR

@@ -1,9 +1,12 @@
-"""Step 1 of Remote Sens. 2024, 16, 793: a coarse image by the motion that inaccurate sensors
-record, a scatterer isolated in two dimensions, and its echo restored for the estimate.
+"""Step 1 of Remote Sens. 2024, 16, 793: isolation of one scatterer before estimation.
+
+A coarse image is formed with the motion that inaccurate sensors record. One scatterer is isolated
+in it in range and azimuth, and its echo is restored for the estimate of the motion.
 
 The paper shows no result of this step. Here it is compared with the gate in range that the other
 items use, for points at three ranges and for points in one range cell. It lowers the errors of the
-velocities. The phase that their integral leaves is due to slow errors, which lie in what is kept.
+velocities. The remaining phase error is the integral of slow velocity errors, which the isolation
+does not remove.
 """
 
 from __future__ import annotations
@@ -62,13 +65,13 @@ def isolate(
 
 
 def _errors(small: bool, snrs_db: Sequence[float] = (-10.0, 0.0, 20.0), scale: float = 0.99) -> Errors:
-    """Errors of the velocity (m/s, rms) and residual phases (rad) of all draws, by scene, SNR per
-    sample before compression and method.
+    """Rms errors of the velocity (m/s) and residual phases (rad) of all draws.
 
-    What sensors record is chosen: the true velocity times `scale`, and 2 mm/s beside it.
+    The keys are scene, SNR per sample before compression, and method. By choice, the velocity that
+    the sensors record is the true one times `scale`, plus 2 mm/s.
     """
     found: Errors = {}
-    ranges_m = (1.2, 1.8)  # of the strongest point
+    ranges_m = (1.2, 1.8)  # range gate around the strongest point
     for scene, snr_db, seed in itertools.product(SCENES, snrs_db, seeds_of(small)):
         world = LadarWorld(SCENES[scene], MOTION, snr_db=snr_db, fidelity=QuadraticInSweep())
         recording, truth = simulate_ladar(RADAR, world, 512, Draws(seed))
@@ -87,7 +90,7 @@ def _errors(small: bool, snrs_db: Sequence[float] = (-10.0, 0.0, 20.0), scale: f
 
 
 def _left(error_m_s: Tensor) -> tuple[float, float]:
-    """Rms of an error of the velocity (m/s), and of the phase (rad) that its integral leaves."""
+    """Rms of a velocity error (m/s), and rms of the residual phase (rad) that it causes."""
     pulse = RADAR.sweep_axes(len(error_m_s))[1]
     error_m = RADAR.period_s * error_m_s.cumsum(-1)
     lit = torch.ones_like(error_m, dtype=torch.bool)
