@@ -15,12 +15,13 @@ from tests.audit.frame import SNR_DB, Batch, Entry, Quantity, World, nothing, rm
 from tests.audit.strips import turntable
 from tests.direct.stripmap import Instrument, echo
 from tests.repair.triangles import ground, record, table1
-from torchsar.core import Draws, Estimate, Signal, Stage
-from torchsar.echo import ChannelResponse, apply_impairments, simulate
+from torchsar.core import Draws, Estimate, Recording, Signal, Stage
+from torchsar.echo import ChannelResponse, QuadratureError, apply_impairments, simulate
 from torchsar.echo.jitter import sample_unevenly
 from torchsar.focus import OmegaK
 from torchsar.radar import LinearFM, StripmapRadar, TriangularLadar
 from torchsar.repair import (
+    BalanceQuadrature,
     BlindJitter,
     DropInterference,
     EstimateFlatResponse,
@@ -82,6 +83,23 @@ def imbalance(
         x = x * torch.polar(gain, phase)[:, torch.arange(lines) % 2, None]
         x = 10 ** (snr_db / 20) * x + draws.normal("noise", (lines, cells), C128)
         return Batch(signal(cast(x)), {"gain": gain, "phase_rad": phase})
+
+    return draw
+
+
+def unequal(snr_db: float, scene: Scene | None = None) -> Callable[[int, int], Batch]:
+    """Draw clutter, or a scene, with unequal I and Q components."""
+
+    def draw(trials: int, seed: int) -> Batch:
+        draws = Draws(seed, trials=range(trials))
+        gain, phase = draws.uniform("gain", (), -2.0, 2.0), draws.uniform("phase", (), -9.0, 9.0)
+        if scene is None:
+            x = 10 ** (snr_db / 20) * speckle(draws, LINES, CELLS) + draws.normal("noise", (LINES, CELLS), C128)
+            recording = Recording(signal(cast(x)), RADAR)
+        else:
+            recording = simulate(RADAR, StripmapWorld(scene, Dwell(0.05), snr_db=snr_db), LINES, 384, draws)[0]
+        impaired = QuadratureError(gain, phase)(recording, draws)[0].signal
+        return Batch(impaired, {"gain_db": gain, "phase_deg": phase})
 
     return draw
 
@@ -344,6 +362,16 @@ def entries() -> list[Entry]:
                 World("turntable", turntable),
             ],
             [Quantity("gain", 0.2, floor=1e-3), Quantity("phase_rad", 0.3, floor=1e-3)],
+        ),
+        Entry(
+            "repair.BalanceQuadrature",
+            BalanceQuadrature(),
+            [
+                *[world for world in none if world.name == "zeros"],
+                *(World("own", unequal(snr), snr) for snr in (-10.0, 10.0, 40.0)),
+                World("few points", unequal(40.0, RandomPoints(3, 100.0, 60.0)), 40.0),
+            ],
+            [Quantity("gain_db", 0.5, floor=0.01), Quantity("phase_deg", 4.0, floor=0.1)],
         ),
         Entry(
             "repair.BlindJitter",

@@ -34,6 +34,7 @@ SAME = {
     "compensate.radial_motion": "compensate.RadialMotion",
     "multichannel.moving_point_velocity": "multichannel.MovingPointVelocity",
     "multichannel.estimate_balance": "multichannel.EstimateBalance",
+    "repair.balance_quadrature": "repair.BalanceQuadrature",
     "repair.line_integrity": "repair.LineIntegrity",
     "repair.estimate_imbalance": "repair.EstimateImbalance",
     "repair.estimate_jitter_blind": "repair.BlindJitter",

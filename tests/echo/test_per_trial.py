@@ -25,8 +25,6 @@ from torchsar.echo import (
     ChannelErrors,
     ChannelImbalance,
     CorruptedNumbers,
-    GainSteps,
-    GateJumps,
     GroundAtRest,
     Leakage,
     LostGaps,
@@ -55,6 +53,7 @@ from torchsar.echo import (
     simulate_turntable,
     smooth_response,
 )
+from torchsar.echo.receiver import GainSteps, GateJumps
 from torchsar.echo.sea import sea_echo
 from torchsar.radar import InverseRadar, Orbit, seen_point
 from torchsar.scene import (

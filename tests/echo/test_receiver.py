@@ -11,7 +11,7 @@ import torch
 from tests.echo.test_interference import RADAR, clutter, power
 from tests.helpers import small_ladar
 from torchsar.core import Axis, Draws, Recording, Signal
-from torchsar.echo import GainSteps, GateJumps, GroundAtRest, Leakage, PulsedInterference, QuadratureError
+from torchsar.echo.receiver import GainSteps, GateJumps, GroundAtRest, Leakage, PulsedInterference, QuadratureError
 
 
 @pytest.mark.parametrize("level_db", [-20.0, 0.0, 30.0])

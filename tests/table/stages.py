@@ -306,6 +306,14 @@ CASES = [
         vmap=False,
         zero_ok="lines of zeros hold no interference",
     ),
+    Case("remove_constant", lambda: repair.RemoveConstant("cell", 2), laws=Laws(pulse="a polynomial of the pulse")),
+    Case("remove_constant_of_pulse", lambda: repair.RemoveConstant("pulse")),
+    Case("remove_tones", lambda: repair.RemoveTones(), laws=Laws(linear="finds tones")),
+    Case(
+        "balance_quadrature",
+        lambda: repair.BalanceQuadrature(),
+        laws=Laws(phase="I and Q are told apart"),
+    ),
     Case(
         "correct_jitter",
         lambda: repair.CorrectJitter(),

@@ -1,9 +1,10 @@
 """Assessment of a Doppler centroid: its standard deviation, quality and outcome.
 
-Three questions are asked of the lines. Are adjacent lines coherent, so that there is anything but
-noise? Are the dwells of the targets complete, or do the ends of the record cut so many that the
-centroid is that of the cut ones? How far do the range blocks scatter? Of an absolute centroid it is
-also asked whether another multiple of the PRF explains the data as well.
+Four questions are asked of the lines. Does a constant or a tone hold the energy? Are adjacent lines
+coherent, so that there is anything but noise? Are the dwells of the targets complete, or do the
+ends of the record cut so many that the centroid is that of the cut ones? How far do the range
+blocks scatter? Of an absolute centroid it is also asked whether another multiple of the PRF
+explains the data as well.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import or_one
 from torchsar.core import Estimate, Outcome, cis, power_of, unit_level, worst
+from torchsar.core.tone import strongest_tone
 from torchsar.metrics.bounds import tone_frequency_bound_hz
 
 # Largest standard deviation of a good estimate in units of the PRF. That predicted for noise is
@@ -37,6 +39,8 @@ class Increments(NamedTuple):
             rad, shape (...,).
         ends: What the mean product of a pair of lines at the first and at the last line adds to the
             sum of the phase increments, shape (..., 2, b), complex128, see below.
+        tone: What the strongest tone adds to the sum of all products, shape (...,), complex128; 0
+            where no tone stands out.
         coherent: True where the products of adjacent lines, or the changes of these products, add
             up to more than in noise, shape (...,).
         scale: Frequency of a phase increment of 1 rad, in Hz.
@@ -53,6 +57,7 @@ class Increments(NamedTuple):
     power: Tensor
     half_band_rad: Tensor
     ends: Tensor
+    tone: Tensor
     coherent: Tensor
     scale: float
 
@@ -93,7 +98,11 @@ class Increments(NamedTuple):
         # number of lines that the ends affect; about half_band * dwell / 6 for a narrow band
         lines = (1 - half_band / torch.tan(half_band)) * dwell / (2 * half_band)
         ends = torch.stack([some.sum(-1) for some in ends], -1) * lines[..., None, None]
-        return Increments(products, power, half_band, ends, coherent, prf_hz / (2 * math.pi))
+        # a spur, or a constant, of which the scene knows nothing
+        spur = strongest_tone(x, rounds=1)
+        energy = torch.where(spur.excess > 20, spur.share.double(), 0) * power.sum((-2, -1))
+        tone = torch.polar(energy, 2 * math.pi * spur.pulse_cycles)
+        return Increments(products, power, half_band, ends, tone, coherent, prf_hz / (2 * math.pi))
 
 
 def _adds_up(products: Tensor) -> Tensor:
@@ -137,6 +146,9 @@ def baseband(found: Estimate, lines: Increments) -> Estimate:
     share = blocks.real.clamp(0, 1).square().sum(-1)
     scatter = (terms.square() + (0.45 * share[..., None] * cuts.sum(-2)).square()).sum(-1).sqrt().clamp_max(math.pi)
     scatter, shift = torch.where(some, scatter, math.pi), cuts.sum((-2, -1)).clamp(-1, 1)
+    # the centroid without the tone, for which it must be a small part of the energy
+    without = lines.products.sum((-2, -1)) - lines.tone
+    away = torch.angle(without * cis(-phase)).abs()
     power = lines.power.sum((-2, -1))
     along = (lines.products.sum(-1) * cis(-phase)[..., None]).real.clamp_min(0)
     extent = along.sum(-1).square() / or_one(along.square().sum(-1)) / along.shape[-1]
@@ -145,11 +157,12 @@ def baseband(found: Estimate, lines: Increments) -> Estimate:
     short = (extent < 0.3) & (along.shape[-1] >= 4)
     return replace(
         found,
-        std={"doppler_baseband_hz": lines.scale * torch.hypot(scatter, shift)},
+        std={"doppler_baseband_hz": lines.scale * torch.hypot(torch.hypot(scatter, shift), away)},
         quality=(lines.products.sum((-2, -1)).abs() / or_one(power)).clamp(0, 1),
         outcome=worst(
             (Outcome.INEXACT, scatter >= 2 * math.pi * MOST_STD),
             (Outcome.MISFIT, short | (shift.abs() >= lines.half_band_rad / 4)),
+            (Outcome.AT_REST, (away > math.pi * MOST_STD) | (lines.tone.abs() > 0.2 * power)),
             (Outcome.NOISE, ~lines.coherent),
             (Outcome.EMPTY, power == 0),
         ),
@@ -187,6 +200,7 @@ def absolute(
         # lines are incoherent, and the deviation is at least a third of that of random frequencies,
         # by choice
         (Outcome.NOISE, ~lines.coherent & (std >= 0.1 * unit)),
+        (Outcome.AT_REST, plain.outcome == Outcome.AT_REST),
         (Outcome.EMPTY, plain.outcome == Outcome.EMPTY),
     )
     best = log_likelihood.topk(min(2, log_likelihood.shape[-1])).values

@@ -44,6 +44,7 @@ class Outcome(IntEnum):
     IN_DOUBT = 20
     UNSPECIFIED = 21
     UNBALANCED = 22
+    AT_REST = 23
     NOISE = 30
     SINGULAR = 31
     EMPTY = 32
@@ -105,6 +106,9 @@ _MESSAGES = {
     Outcome.IN_DOUBT: "an estimate on which this one depends is doubtful",
     Outcome.UNSPECIFIED: "not reliable, for a reason that was not given",
     Outcome.UNBALANCED: "the channels differ in phase, gain or delay: balance them first (estimate_balance)",
+    Outcome.AT_REST: (
+        "a constant, a tone or ground at rest holds the energy: subtract it first (remove_constant, remove_tones)"
+    ),
     Outcome.NOISE: "nothing rises above the noise: raise the SNR, or use more pulses or range cells",
     Outcome.SINGULAR: "the data do not determine the values: use more of them, or fewer unknowns",
     Outcome.EMPTY: "there are no samples other than zero",

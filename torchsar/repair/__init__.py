@@ -9,6 +9,9 @@ line numbers, irregular lines       `line_integrity`, first of all; `regular_lin
                                     whose numbers, times or window starts are right
 missing lines                       `sparse_fill`; faster and less exact `band_limited_fill`,
                                     `linear_fill`, `zero_fill`
+constant, drift, ground at rest     `remove_constant`, before any estimator
+spurs                               `remove_tones`
+unequal I and Q                     `balance_quadrature`, after `remove_constant`
 narrowband interference             `subtract_interference`; `notch_interference`;
                                     `drop_interference` with a fill after it
 sampling jitter, with a pilot tone  `estimate_jitter_pilot`, then `correct_jitter`
@@ -28,6 +31,14 @@ functions for the response.
 """
 
 from torchsar.repair.channels import CorrectImbalance, EstimateImbalance, correct_imbalance, estimate_imbalance
+from torchsar.repair.constant import (
+    BalanceQuadrature,
+    RemoveConstant,
+    RemoveTones,
+    balance_quadrature,
+    remove_constant,
+    remove_tones,
+)
 from torchsar.repair.fill import (
     BandLimitedFill,
     LinearFill,
@@ -74,6 +85,7 @@ from torchsar.repair.triangle_calibrate import CalibrateSweeps, calibrate_sweeps
 from torchsar.repair.trigger import find_trigger
 
 __all__ = [
+    "BalanceQuadrature",
     "BandLimited",
     "BandLimitedFill",
     "BlankTurningPoints",
@@ -92,10 +104,13 @@ __all__ = [
     "LinearFill",
     "NotchInterference",
     "PilotJitter",
+    "RemoveConstant",
+    "RemoveTones",
     "SparseFill",
     "SplitSweeps",
     "SubtractInterference",
     "ZeroFill",
+    "balance_quadrature",
     "band_limited_fill",
     "blank_turning_points",
     "calibrate_sweeps",
@@ -114,6 +129,8 @@ __all__ = [
     "linear_fill",
     "notch_interference",
     "regular_lines",
+    "remove_constant",
+    "remove_tones",
     "sparse_fill",
     "subtract_interference",
     "zero_fill",

@@ -1,12 +1,13 @@
 """Assessment of the phases of pulses: whether they can be trusted, and how exact they are.
 
-Five questions are asked of any phases, whatever method found them:
+Six questions are asked of any phases, whatever method found them:
 
 1. Is the image sharper than the one that autofocus makes of noise?
 2. Is a homogeneous description of the scene not likelier (`describe`)?
 3. Does no block of neighbouring range cells get sharper with phases of its own than noise explains?
 4. How far apart are the phases of two halves of the range cells? This is the standard deviation.
 5. Are the range profiles aligned (`displacement`)?
+6. Does what the phases leave unfocused get sharper with phases of its own (`gain_of_rest`)?
 """
 
 from __future__ import annotations
@@ -24,13 +25,13 @@ from torchsar.compensate.pulse_phase.data import (
     by_blocks,
     on_the_circle,
     or_one,
-    pair_phase,
     rotate,
     without_line,
 )
 from torchsar.compensate.pulse_phase.fixed_point import LogAbove, Run, fixed_point
 from torchsar.compensate.pulse_phase.homogeneous import describe, different_rows, occupied_band
 from torchsar.compensate.pulse_phase.imaging import AlongPulses, Through
+from torchsar.compensate.pulse_phase.parts import gain_of_parts, gain_of_rest
 from torchsar.compensate.pulse_phase.sharpness import scatter_of_point, sharpness_beyond_speckle, sharpness_of_noise
 from torchsar.core import Estimate, Outcome, fft_lines, host_value, power_of, worst
 from torchsar.metrics.phase import phase_rmse, residual_phase
@@ -74,12 +75,13 @@ def conclude(
         Outcomes: EMPTY; SINGULAR with fewer than three pulses; NOISE if the image is less than 1.5
         times as sharp as autofocus makes noise; INEXACT if the Strehl ratio is below 0.8;
         PARTS_DISAGREE if one of three blocks of range cells gets sharper with phases of its own by
-        more than 2.2 times the sharpness of noise; HOMOGENEOUS; TOO_FEW if a single scatterer makes
+        more than 2.2 times the sharpness of noise; AT_REST if the rest does, by more than 1.5 times
+        that (`gain_of_rest`); HOMOGENEOUS; TOO_FEW if a single scatterer makes
         the sharpness and its modulus is not steady, or one gap takes more than 0.36 of the pulses;
         DISPLACED. Of a steady single scatterer the standard deviation is the scatter of its modulus
         and phase. `info` holds "present", shape (..., pulse), False for pulses of zeros; and, of
         shape (...,), "iterations", and if assessed "sharpness_nats", "noise_sharpness_nats",
-        "gain_of_parts", "jitter_cells" and "migration_cells".
+        "gain_of_parts", "gain_of_rest", "jitter_cells" and "migration_cells".
     """
     trials, n = pulses.trials, pulses.n
     enough = pulses.present.sum(-1) >= 3
@@ -93,7 +95,7 @@ def conclude(
         return Estimate(value, unknown, torch.zeros_like(outcome).to(phase_rad.dtype), outcome, info)
     rows, present, again = pulses.rows.detach(), pulses.present, again or settled
     seen = by_blocks(pulses, partial(_seen, rows, present, phase_rad.detach(), again, through), through is not None)
-    sharp, noise, std, gain, unsteady, homogeneous, jitter, migration = (x.reshape(trials) for x in seen)
+    sharp, noise, std, gain, rest, unsteady, homogeneous, jitter, migration = (x.reshape(trials) for x in seen)
     gap = longest_gap(pulses.present).reshape(trials)
     strehl = torch.exp(-std.square())
     outcome = worst(
@@ -101,6 +103,9 @@ def conclude(
         # The gain was at most 2.2 in 99 % of the correct trials with 3 to 25 points. It exceeded
         # 2.4 in 90 % of the trials in which a vehicle as strong as 30 points moves independently.
         (Outcome.PARTS_DISAGREE, gain > 2.2),
+        # at most 0.9 in right trials of 1 to 100 points, at least 2.0 where a constant, a tone or
+        # ground at rest is stronger than the target
+        (Outcome.AT_REST, rest > 1.5),
         (Outcome.HOMOGENEOUS, homogeneous > 0),
         # If a gap exceeds this fraction of the record, the phase between the pulses before and
         # after it cannot be determined in a scene of many points.
@@ -112,7 +117,7 @@ def conclude(
         (Outcome.SINGULAR, ~enough.reshape(trials)),
     )
     beyond = (1 - noise / or_one(sharp)).clamp(0, 1)
-    info |= {"sharpness_nats": sharp, "noise_sharpness_nats": noise, "gain_of_parts": gain}
+    info |= {"sharpness_nats": sharp, "noise_sharpness_nats": noise, "gain_of_parts": gain, "gain_of_rest": rest}
     return Estimate(
         value,
         {"phase_rad": std[..., None].expand(*trials, n).to(phase_rad.dtype)},
@@ -141,8 +146,9 @@ def _seen(
 ) -> tuple[Tensor, ...]:
     """Quantities of a block of trials from which the outcome follows, (trial,) each, float64.
 
-    In this order: sharpness, sharpness of noise, standard deviation, gain of parts, 1 where a
-    single scatterer is not steady, 1 where the scene is homogeneous, jitter, migration.
+    In this order: sharpness, sharpness of noise, standard deviation, gain of parts, gain of the
+    rest, 1 where a single scatterer is not steady, 1 where the scene is homogeneous, jitter,
+    migration.
     """
     which = torch.arange(len(rows), device=rows.device)[part]
     rows, present, phase = rows[part], present[part], phase[part]
@@ -153,7 +159,7 @@ def _seen(
     if through is not None:
         halves = halves_of_image(through, rows, phase)
         std = half_difference(halves, present, phase, partial(_from, again, which))
-        return sharp, noise, std, *[zero] * 5
+        return sharp, noise, std, *[zero] * 6
     spectrum = fft_lines(rows)
     band = occupied_band(spectrum)
     apart = half_difference(halves_of_rows(rows), present, phase, partial(_disturbed, again, which, present))
@@ -171,6 +177,7 @@ def _seen(
         noise,
         torch.where(single & steady, torch.hypot(scatter, rest), apart / band.sqrt()),
         gain_of_parts(rows, present, phase),
+        gain_of_rest(rows, present, phase),
         (single & ~steady).double(),
         ((describe(rows, phase, band)[1] > 1) & ~single).double(),
         jitter,
@@ -194,33 +201,6 @@ def longest_gap(present: Tensor) -> Tensor:
     steps = torch.where(present[:, 1:] & (number[1:] > first), number[1:] - last[:, :-1], 1).amax(-1)
     span = (last[:, -1:] - first + 1)[:, 0]
     return torch.where(present.any(-1), (steps - 1).double() / or_one(span.double()), 0)
-
-
-def gain_of_parts(rows: Tensor, present: Tensor, phase: Tensor) -> Tensor:
-    """Compute how much sharper blocks of neighbouring range cells get with phases of their own.
-
-    Args:
-        rows: Pulses, shape (trial, range, pulse), complex.
-        present: False where a pulse holds only zeros, shape (trial, pulse).
-        phase: Phases of all range cells in rad, shape (trial, pulse).
-
-    Returns:
-        The largest gain of three blocks in units of the sharpness that autofocus makes of noise in
-        as many range cells, shape (trial,), float64.
-    """
-    gains = [torch.zeros(len(rows), dtype=torch.float64, device=rows.device)]
-    # three blocks separate correct trials best from those with a second motion
-    for block in rows.tensor_split(3, -2):
-        if not block.shape[-2]:
-            continue
-        energy = power_of(block).sum(-1)
-        strongest = energy.topk(min(48, block.shape[-2]), -1).indices
-        block = block.gather(-2, strongest[..., None].expand(-1, -1, rows.shape[-1]))
-        own = fixed_point(block, pair_phase(block, present), Run(LogAbove(2.5), AlongPulses(), 12, 1.8, 0.0))[0]
-        images = (torch.fft.fft(rotate(block, at), norm="ortho") for at in (own, phase))
-        (alone, count, _), (common, _, _) = (sharpness_beyond_speckle(image) for image in images)
-        gains.append((alone - common) / sharpness_of_noise(count.clamp_min(1)))
-    return torch.stack(gains).amax(0)
 
 
 def halves_of_rows(rows: Tensor) -> tuple[Tensor, Tensor]:

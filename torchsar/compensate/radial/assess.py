@@ -15,7 +15,7 @@ from torchsar.compensate.radial.bands import filled
 from torchsar.compensate.radial.measured import LEAST_SQUARED, TINY, Intercept, Levels, Measured, mean_of
 from torchsar.compensate.radial.phases import SAME_RAD, Walk
 from torchsar.compensate.radial.product import mirror_velocity
-from torchsar.core import Axis, Estimate, Outcome, cis, host_value, power_of, true_positions, worst
+from torchsar.core import Axis, Estimate, Outcome, cis, host_value, power_of, true_positions, unit_level, worst
 from torchsar.metrics.phase import phase_rmse
 
 # least number of periods with an echo from which phases are estimated
@@ -23,7 +23,7 @@ LEAST_PERIODS = 8
 
 
 @torch.no_grad()
-def assessed_velocity(found: Estimate, measured: Measured, pulse: Axis) -> Estimate:
+def assessed_velocity(found: Estimate, measured: Measured, pulse: Axis, sweeps: Tensor) -> Estimate:
     """Add standard deviation and outcome to an estimate of radial velocities.
 
     Noise, and the interference of scatterers of random phases, change the power of the echo as much
@@ -42,6 +42,7 @@ def assessed_velocity(found: Estimate, measured: Measured, pulse: Axis) -> Estim
         found: Estimate of the velocities.
         measured: What the method measured.
         pulse: Slow-time axis; each entry is a period of one up and one down sweep.
+        sweeps: The sweeps as recorded, shape (..., 2, pulse, N), complex.
 
     Returns:
         The estimate with its standard deviation, and with the outcome
@@ -50,6 +51,8 @@ def assessed_velocity(found: Estimate, measured: Measured, pulse: Axis) -> Estim
           periods, or the standard deviation exceeds 0.035 lambda / T (T is the length of a sweep);
         - AMBIGUOUS where both sweeps have more power in common at another velocity, in more than
           one period of 20;
+        - AT_REST where a constant holds more than a fifth of the energy, and the velocity is about
+          zero, as that of the constant, in more than one period of 20;
         - NOISE where they have no more in common than noise at any velocity;
         - EMPTY where all samples are zero.
     """
@@ -60,12 +63,16 @@ def assessed_velocity(found: Estimate, measured: Measured, pulse: Axis) -> Estim
     highest = torch.fft.fft(measured.still, 2 * m).abs().amax(-1).to(torch.float64) / m
     best = Levels.of(highest, product)
     elsewhere = mean_of((highest > 1.1 * measured.common).to(torch.float64), lit)[..., 0]
+    unit = unit_level(sweeps.detach(), 3)
+    share = power_of(unit.mean((-3, -2, -1))) / power_of(unit).mean((-3, -2, -1)).clamp_min(TINY)
+    still = mean_of((measured.raw_m_s.abs() < 0.1 * bin_m_s).to(torch.float64), lit)[..., 0]
     # A velocity with an error of 0.07 bins or more is of no use. Noise alone gives 0.05 at the
     # lowest sufficient SNR.
     useless = mean_of(square, product.lit)[..., 0] >= (0.07 * bin_m_s) ** 2
     outcome = worst(
         (Outcome.INEXACT, ~measured.enough | useless),
         (Outcome.AMBIGUOUS, (best.squared >= LEAST_SQUARED) & (elsewhere > 0.05)),
+        (Outcome.AT_REST, (share > 0.2) & (still > 0.05)),
         # below 9 dB, noise alone may cause the peak of the product of both sweeps, by trial
         (Outcome.NOISE, ~lit.any(-1) | (~measured.enough & (best.squared < 10**0.9))),
         (Outcome.EMPTY, (measured.common == 0).all(-1)),

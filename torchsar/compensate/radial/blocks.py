@@ -58,7 +58,7 @@ def velocities(
     def estimator(sweeps: Tensor, azimuth_m: Tensor | float) -> Estimate:
         measured = measure(Spectra.of(sweeps, radar))
         found = measured.estimate(pulse, azimuth_m)
-        return assessed_velocity(found, measured, pulse) if assess else found
+        return assessed_velocity(found, measured, pulse, sweeps) if assess else found
 
     return by_trials(name, estimator, sweeps, radar, pulse, azimuth_m)
 

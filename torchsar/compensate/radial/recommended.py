@@ -112,7 +112,9 @@ def radial_motion(
         coarse = measured.estimate(pulse, azimuth_m)
         cells = deramped_lines(bands, coarse["velocity_m_s"], pulse)
         found, walk = polished(cells, coarse, measured.enough, pulse, radar, iterations, tolerance_rad)
-        return assessed_motion(assessed_velocity(found, measured, pulse), cells, walk) if assess else found
+        if not assess:
+            return found
+        return assessed_motion(assessed_velocity(found, measured, pulse, sweeps), cells, walk)
 
     return by_trials("radial_motion", estimator, sweeps, radar, pulse, azimuth_m)
 

@@ -1,0 +1,75 @@
+"""Estimates name what is at rest where it holds the energy, and are right once it is removed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+
+from tests.audit import ladars, pulses, strips
+from tests.compensate.scenes import noisy, still, turned, white
+from torchsar.compensate import DopplerCentroid, MirrorProduct, PhaseIncrement, SegmentedInterference, autofocus, sca
+from torchsar.core import Draws, Outcome, Recording, Signal
+from torchsar.echo import GroundAtRest, Leakage, apply_impairments
+from torchsar.metrics import phase_rmse
+from torchsar.repair import remove_constant, remove_tones
+
+TRIALS = 6
+
+
+def impaired(signal: Signal, radar, impairment) -> torch.Tensor:
+    draws = Draws(5, trials=range(len(signal.data)))
+    return apply_impairments(Recording(signal, radar), {"it": impairment}, draws)[0].signal.data
+
+
+def scene() -> tuple[Signal, torch.Tensor]:
+    phase = white(TRIALS, pulses.PULSES, 4)
+    return pulses.signal(turned(noisy(still(TRIALS, pulses.PULSES, 48, 1, 0.8, 3), 20.0, 5), phase)), phase
+
+
+@pytest.mark.parametrize("level_db", [3.0, 10.0, 30.0])
+@pytest.mark.parametrize(
+    ("effect", "remove"),
+    [
+        (lambda level: Leakage(level), remove_constant),
+        (lambda level: Leakage(level, 0.15, 0.21), remove_tones),
+        (lambda level: Leakage(level + 17, position=0.3), lambda x: remove_constant(x, "cell")),
+        (lambda level: GroundAtRest(level), lambda x: remove_constant(x, "cell", 8)),
+    ],
+    ids=["constant", "spur", "one cell", "ground"],
+)
+def test_phases_of_pulses(effect: Callable, remove: Callable, level_db: float) -> None:
+    signal, phase = scene()
+    found = autofocus(signal.data)
+    assert found.ok.all() and not (found.info["gain_of_rest"] > 1.5).any()
+    data = impaired(signal, pulses.LADAR, effect(level_db))
+    for method in (autofocus, sca):
+        assert (method(data).outcome == Outcome.AT_REST).all()
+    again = autofocus(remove(data))
+    assert again.ok.all() and phase_rmse(again["phase_rad"], phase).max() < 0.15
+
+
+@pytest.mark.parametrize("level_db", [-20.0, 0.0, 30.0])
+@pytest.mark.parametrize(("spur", "remove"), [((0.0, 0.0), remove_constant), ((0.15, 0.21), remove_tones)])
+def test_doppler(spur: tuple[float, float], remove: Callable, level_db: float) -> None:
+    batch = strips.strip(doppler_hz=60.0)(TRIALS, 3)
+    data = impaired(batch.data, strips.RADAR, Leakage(level_db, *spur))
+    for stage in (PhaseIncrement(strips.RADAR), DopplerCentroid(strips.RADAR)):
+        expected = Outcome.OK if level_db < -10 else Outcome.AT_REST
+        assert (stage(batch.data.with_data(data)).outcome == expected).all()
+        found = stage(batch.data.with_data(remove(data)))
+        clean, name = stage(batch.data), "doppler_baseband_hz"
+        assert found.ok.all() and (found[name] - clean[name]).abs().max() < 0.5
+
+
+@pytest.mark.parametrize("level_db", [-10.0, 0.0, 30.0])
+def test_velocity_of_a_ladar(level_db: float) -> None:
+    batch = ladars.own()(TRIALS, 3)
+    data = impaired(batch.data, ladars.RADAR, Leakage(level_db))
+    for stage in (MirrorProduct(ladars.RADAR), SegmentedInterference(ladars.RADAR)):
+        expected = Outcome.OK if level_db < 0 else Outcome.AT_REST
+        assert (stage(batch.data.with_data(data)).outcome == expected).all()
+        clean, again = stage(batch.data), stage(batch.data.with_data(remove_constant(data)))
+        errors = [ladars.slow(found["velocity_m_s"], batch.truth["velocity_m_s"]) for found in (clean, again)]
+        assert again.ok.all() and (errors[1] < 1.1 * errors[0]).all()
