@@ -418,10 +418,10 @@ class Recording(Shown):
             Recording with the axes that `radar.raw_axes` gives, and the side data in `aux`.
 
         Raises:
-            ValueError: If `dtype` or the samples are not complex, there are no samples, a sample is
-                not finite or becomes infinite by the conversion, side data are not numbers,
-                `agc_db` or `line_number` does not have one entry per line, a line number is not
-                whole, or `agc_db` exceeds +-200 dB.
+            ValueError: If `dtype` or the samples are not complex, there are no samples, or a sample
+                is not finite or becomes infinite by the conversion. For side data: if they are not
+                numbers, `agc_db` or `line_number` does not have one entry per line, a line number
+                is not whole, or `agc_db` exceeds +-200 dB.
         """
         if not dtype.is_complex:
             raise ValueError(f"{what}: dtype must be complex64 or complex128, got {dtype}")

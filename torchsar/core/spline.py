@@ -156,9 +156,9 @@ def second_differences(values: Tensor) -> Tensor:
     At the inner knots the second derivatives M of the spline through the values y solve M[i-1] + 4
     M[i] + M[i+1] = 6 (y[i-1] - 2 y[i] + y[i+1]). The not-a-knot condition makes M linear over the
     first three knots and over the last three. Then M[1] and M[n-2] are the second differences of y
-    at these two knots. The equations for the knots between them are solved all at once: by
-    convolution with the response of the infinite grid, z^|k| / (2 sqrt 3) at a distance of k knots
-    with z = sqrt 3 - 2, plus two decaying terms that give M[1] and M[n-2] their values.
+    at these two knots. The equations for the knots between them are solved at once by convolution
+    with the response of the infinite grid. At a distance of k knots the response is z^|k| / (2 sqrt
+    3) with z = sqrt 3 - 2. Two decaying terms are added, which give M[1] and M[n-2] their values.
 
     Args:
         values: Values y at the knots, shape (..., n) with n >= 2, float64.

@@ -89,11 +89,11 @@ class StripPlan:
 def guard_lines(radar: StripmapRadar, band_hz: float | None, seam_db: float = -60.0) -> float:
     """Compute how far beyond its aperture an azimuth filter reaches.
 
-    A raised-cosine edge of width w has tails whose energy beyond the time t is at most 3e-5
-    (w t)^-5 of that of the filter, as measured. Where the spectrum is cut at a weight W, as at the
-    ends of the PRF band, it jumps by 2 W at most. The energy beyond g lines is then W^2 / (pi^2 g)
-    at most, which is missing in a block and, since the transform of a block is circular, enters it
-    from the other side: together 2 W^2 / (pi^2 g).
+    A raised-cosine edge of width w has tails whose energy beyond the time t is at most 3e-5 (w
+    t)^-5 of that of the filter, as measured. Where the spectrum is cut at a weight W, as at the
+    ends of the PRF band, it jumps by 2 W at most. The energy beyond g lines is then at most W^2 /
+    (pi^2 g). It is missing in a block. Since the transform of a block is circular, the same energy
+    also enters the block from the other side, so that the sum is 2 W^2 / (pi^2 g).
 
     Args:
         radar: Radar of the recording.

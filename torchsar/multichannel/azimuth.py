@@ -191,9 +191,9 @@ def known_motion_chain(
 ) -> Chain:
     """Build the chain of stages from channels to the images of points of known motion.
 
-    When it is run, the chain needs the motion of each point by the names `given.u_r_m_s`,
-    `given.u_a_m_s`, `given.y0_m` and `given.range_m`, each of shape (trial,): slant-range and
-    along-track speed in m/s, along-track position and closest range in metres.
+    When it is run, the chain needs the motion of each point under the names `given.u_r_m_s`,
+    `given.u_a_m_s`, `given.y0_m` and `given.range_m`, each of shape (trial,). These are slant-range
+    and along-track speed in m/s, along-track position and closest range in metres.
 
     Args:
         radar: Radar parameters.

@@ -496,10 +496,10 @@ def suppressed_image(
     """Image moving targets with suppressed sea, matched to several slant-range speeds.
 
     In every Doppler bin the channels are weighted by the inverse of their covariance, which is
-    estimated from all range lines and neighbouring bins, and then by the channel response to a
-    point of each speed. This extends the Doppler filter of the Reference to several channels. The
-    intensity image of each speed is divided by its median, and the maximum over the speeds is taken
-    in each pixel.
+    estimated from all range lines and neighbouring bins. They are then weighted by the channel
+    response to a point of each speed. This extends the Doppler filter of the Reference to several
+    channels. The intensity image of each speed is divided by its median, and the maximum over the
+    speeds is taken in each pixel.
 
     Args:
         signal: Channels with the axes (channel, pulse, range), without trials.

@@ -119,10 +119,10 @@ def _fit(x: Tensor, m: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     The frequency is that of the strongest spectral line, refined jointly with the phasors by the
     phase slope that remains.
 
-    Returns for each trial: the frequency in cycles per sample; the variance of a sample about the
-    fit; the mean power of the phasors; the squares of their phases; and the phases in rad relative
-    to the tone, with mean zero, (..., M). The squares are weighted so that without jitter their
-    ratio to the noise is chi-squared with M - 1 degrees of freedom.
+    Returns for each trial the frequency in cycles per sample, the variance of a sample about the
+    fit, the mean power of the phasors, and the weighted squares of their phases. The last result is
+    the phases in rad relative to the tone, with mean zero, (..., M). The squares are weighted so
+    that without jitter their ratio to the noise is chi-squared with M - 1 degrees of freedom.
     """
     n, fine = x.shape[-1], 4 * x.shape[-1]
     peak = torch.fft.fft(x, fine).abs().argmax(-1)

@@ -271,9 +271,11 @@ def _interpolation(
     """Weights (row, line) that interpolate lines of uneven times to rows of a grid, and the number
     of the first line.
 
-    They are the best ones for a spectrum that is flat in a band about the centroid, with white
-    noise (Wiener). band: share of the pulse rate; noise: its power relative to the signal, both by
-    choice.
+    The weights are optimal for a spectrum that is flat in a band about the centroid, with white
+    noise (Wiener).
+
+    band: width of the band relative to the pulse rate, by choice. noise: power of the noise
+    relative to the signal, by choice.
     """
     middle = torch.searchsorted(time, out)
     index = middle[:, None] + torch.arange(-(taps // 2), taps - taps // 2)

@@ -270,9 +270,9 @@ class SubLooks:
     def power(self, missing: Tensor, unexplained: Tensor) -> Tensor:
         """Estimate the local power of every sub-look of the focused lines.
 
-        The local power is the geometric mean of two estimates: the locally averaged power of the
-        sub-look; and the mean power of the sub-look times the local power of the whole image
-        relative to its mean.
+        The local power is the geometric mean of two estimates. The first is the locally averaged
+        power of the sub-look. The second is the mean power of the sub-look times the local power of
+        the whole image relative to its mean.
 
         Args:
             missing: Range spectra of missing lines, shape (..., range frequency, m).

@@ -230,10 +230,11 @@ def sweep_grid(loaded: Loaded, trial: SweepTrial) -> Grid:
 
 
 def identity(loaded: Loaded, chains: Iterable[Chain] = ()) -> dict[str, Any]:
-    """Return what the results depend on besides the grid: the seed and the source of the random
-    numbers, all other keys of the config that change results, the contents of the files that it
-    names, the code of torchsar and of the user's own stages in the chains, and the versions of
-    torch and numpy.
+    """Return what the results depend on besides the grid.
+
+    This includes the seed and the source of the random numbers, all other keys of the config that
+    change results, and the contents of the files that it names. It also includes the code of
+    torchsar and of the user's own stages in the chains, and the versions of torch and numpy.
     """
     tree = loaded.config.model_dump(exclude=_NOT_IDENTITY)
     drawn = identity_of_draws(loaded.config.seed, loaded.config.random)

@@ -134,9 +134,9 @@ class Store:
     def due(self) -> bool:
         """Whether results should be written now.
 
-        This is so 4 s after the results were last written, earlier if writing takes less than 0.5 %
-        of this time, later if it takes more than 10 %, or if the saved arrays of 64 trials wait to
-        be written.
+        Results are written if 4 s have passed since the last time. They are written earlier if
+        writing takes less than 0.5 % of the time, and later if it takes more than 10 %. They are
+        also written if the saved arrays of 64 trials wait.
         """
         # The interval in seconds between writes is 4 s. It is shorter if writing then takes at most
         # half a percent of the time, and longer if writing would take more than a tenth.

@@ -165,9 +165,10 @@ def joined_found(parts: Sequence[Mapping[str, Found]]) -> dict[str, Found]:
 
 
 def summary(metrics: Metrics) -> dict[str, float]:
-    """Return the mean of each metric over the trials in which it is finite, and its standard
-    deviation as `<name>_sd` if there are several such trials; of `ok` the mean over the trials that
-    were assessed.
+    """Return the mean of each metric over the trials in which it is finite.
+
+    If there are several such trials, `<name>_sd` is the standard deviation. The mean of `ok` is
+    that over the trials that were assessed.
     """
     row: dict[str, float] = {}
     for name, value in metrics.items():

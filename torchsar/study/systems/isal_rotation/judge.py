@@ -174,9 +174,11 @@ class CrossRangeCut:
 
     @property
     def figures(self) -> dict[str, Tensor]:
-        """Figures of the point response, (trial,) each: the amplitude `peak`; the width
-        `irw_azimuth_m` between the first crossings of -3 dB on either side of the peak; and
-        `pslr_azimuth_db`, the strongest response beyond the first minima on either side.
+        """Figures of the point response, (trial,) each.
+
+        `peak` is the amplitude. `irw_azimuth_m` is the width between the first crossings of -3 dB
+        on both sides of the peak. `pslr_azimuth_db` is the level of the strongest response beyond
+        the first minima on both sides.
         """
         power = torch.where(self.inside, self.line.abs().square(), 0)
         top = power.argmax(-1, keepdim=True)
