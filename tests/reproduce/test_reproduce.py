@@ -41,6 +41,7 @@ from torchsar.reproduce.record import entry, read, write
         (1.15, 0.0, "", NOT_REPRODUCED),
         (1.15, 0.09, "", NOT_REPRODUCED),  # a deviation does not widen the tolerance
         (1.05, 0.5, "", NOT_REPRODUCED),  # a poor estimate proves nothing
+        (0.95, 0.5, "lower", NOT_REPRODUCED),
         (0.5, 0.0, "lower", BETTER),
         (0.5, 0.0, "higher", NOT_REPRODUCED),
         (1.5, 0.0, "higher", BETTER),

@@ -97,7 +97,7 @@ def verdict(published: float, ours: float, std: float, tolerance: float, better:
     gap = ours - published
     if abs(gap) <= tolerance and std <= tolerance:
         return REPRODUCED
-    improved = (better == "lower" and gap < 0) or (better == "higher" and gap > 0)
+    improved = (better == "lower" and gap < -tolerance) or (better == "higher" and gap > tolerance)
     return BETTER if improved and math.isfinite(gap) else NOT_REPRODUCED
 
 
