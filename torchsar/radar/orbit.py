@@ -17,8 +17,9 @@ from torch import Tensor
 from torchsar.core import per_trial
 
 EARTH_RADIUS_M = 6_378_137.0  # equatorial radius of WGS 84
-EARTH_GRAVITY_M3_S2 = 3.986004418e14  # GM of WGS 84
-EARTH_RATE_RAD_S = 7.2921159e-5  # one rotation in a sidereal day of 86164.09 s
+EARTH_GRAVITY_M3_S2 = 3.986004418e14  # gravitational parameter GM of WGS 84
+# rotation rate of the Earth: one rotation in a sidereal day of 86164.09 s
+EARTH_RATE_RAD_S = 7.2921159e-5
 
 
 @dataclass(frozen=True)

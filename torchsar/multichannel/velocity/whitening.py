@@ -159,7 +159,7 @@ def line_whitening(lines: Tensor, radar: BistaticRadar, samples: int = 60) -> Wh
     rest = PointMotion.of(radar, lines)
     ramp = torch.roll(
         shared_response(radar, rest, n, 2, torch.complex128), -n, -1
-    )  # a bin i of an FFT over one band is bin i - n over two bands
+    )  # the bins of two bands begin at -n; the roll arranges them like those of an FFT
     flat = _spectrum(lines.to(torch.complex128)) * ramp.conj()
     products = flat[..., :, None, :] * flat.conj()[..., None, :, :]
     total = products.new_zeros(*products.shape[:-1], (n - 1) * groups // n + 1).index_add(-1, group, products).sum(-4)

@@ -34,8 +34,9 @@ from torchsar.study.trials.cuts import impulse_cuts
 RADAR = TriangularLadar(
     LIGHT_M_S / 1.55e-6, bandwidth_hz=5e9, period_s=16e-6, sample_rate_hz=64e6, speed_m_s=60.0, reference_range_m=3000.0
 )
-# Values that are not published. BEAM_RAD: an azimuth aperture of 0.342 m, which gives the published
-# width of 6.0 mm. Positions and motion.
+# The following values are not published: the width of the beam, the positions of the points, and
+# the motion.
+# The beam has an azimuth aperture of 0.342 m, which gives the published width of 6.0 mm.
 BEAM_RAD = 114e-6
 PLACES_M = ((-0.06, 1.0), (0.0, 1.5), (0.06, 2.0))
 SCENE = Points(*zip(*PLACES_M, strict=True), amplitude=[0.7, 1.0, 0.7])
