@@ -266,7 +266,8 @@ class DopplerCentroid(Stage):
             )
         if reach < 1:
             raise ValueError(f"reach must be 1 or more (largest Doppler ambiguity to search, in PRFs), got {reach}")
-        # for up to 70 degrees of squint, at which the absolute Doppler is 0.94 * 2 v / lambda
+        # the limit allows up to 70 degrees of squint, at which the absolute Doppler is 0.94 * 2
+        # v / lambda
         most = math.floor(1.88 * radar.velocity_m_s / (radar.wavelength_m * radar.prf_hz) - 0.5)
         self.radar, self.reference, self.reach = radar, reference, max(0, min(reach, most))
         self.blocks, self.assess = blocks, assess

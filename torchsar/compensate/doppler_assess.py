@@ -152,8 +152,8 @@ def baseband(found: Estimate, lines: Increments) -> Estimate:
     power = lines.power.sum((-2, -1))
     along = (lines.products.sum(-1) * cis(-phase)[..., None]).real.clamp_min(0)
     extent = along.sum(-1).square() / or_one(along.square().sum(-1)) / along.shape[-1]
-    # Targets that are illuminated for a smaller part of the record are cut by its end, or are
-    # nearly as short in time as the drift of their Doppler.
+    # Targets illuminated in an effective share below 0.3 of the record are cut by an end of the
+    # record. Otherwise their dwell is nearly as short as the time in which their Doppler drifts.
     short = (extent < 0.3) & (along.shape[-1] >= 4)
     return replace(
         found,

@@ -269,8 +269,9 @@ def _true_doppler(world: StripmapWorld, radar: StripmapRadar) -> Tensor | float:
 
 
 def _line_length(placed: Placed, radar: StripmapRadar, n_range: int) -> int:
-    """FFT length in which no echo wraps: the line itself if all echoes fit into it, otherwise one
-    pulse more.
+    """FFT length in which no echo wraps.
+
+    It is the length of a line if all echoes fit into it, otherwise longer by a pulse.
     """
     first, last = (
         2 * (float(closest) - radar.near_range_m) / radar.wave_speed_m_s * radar.sampling_hz

@@ -252,8 +252,9 @@ def _phase_only(
 def _dechirped(
     radar: InverseRadar, world: TurntableWorld, course: _Course, n_fast: int, draws: Draws, dtype: torch.dtype
 ) -> _Simulated:
-    """Simulate with `Dechirped`, in which the noise of the receiver has no phase error. The results
-    are those of `_phase_only`.
+    """Simulate with `Dechirped`, in which the noise of the receiver has no phase error.
+
+    Returns the same five results as `_phase_only`.
     """
     n_pulse, track = course.moved_m.shape[-1], world.fidelity.track if isinstance(world.fidelity, Dechirped) else ()
     turned = partial(

@@ -49,7 +49,8 @@ class Search:
     u_r_m_s: float = 21.6
     u_a_m_s: float = 20.0
     y0_m: float = 150.0
-    # found by trial; at most 2 dB are lost between hypotheses, most of them by the step of u_a
+    # steps found by trial; at most 2 dB of the peak are lost between hypotheses, mostly by the step
+    # of u_a
     u_r_step_m_s: float = 3.0
     u_a_step_m_s: float = 0.5
 

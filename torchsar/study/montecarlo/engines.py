@@ -234,7 +234,9 @@ def _local(distributed: Any, workers: int, threads: int) -> Iterator[Engine]:
 
 @contextmanager
 def _remote(distributed: Any, address: str, threads: int) -> Iterator[Engine]:
-    for part in ("client", "utils"):  # the loss of a scheduler is reported once, as one sentence
+    # the logs of dask are suppressed, so that the loss of a scheduler is reported once, as one
+    # sentence
+    for part in ("client", "utils"):
         logging.getLogger(f"distributed.{part}").setLevel(logging.CRITICAL)
     try:
         client = distributed.Client(address, timeout=20)
