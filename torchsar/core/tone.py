@@ -44,8 +44,8 @@ class Tone(NamedTuple):
 def strongest_tone(x: Tensor, rounds: int = 0) -> Tone:
     """Find the strongest tone of pulses, with one frequency along samples and one along pulses.
 
-    The range frequency is that with the most power above its neighbours, in at most 128 of the
-    pulses; the spectrum along pulses is formed at this frequency alone.
+    The frequency along samples is that whose power exceeds the mean of its neighbours most, in at
+    most 128 of the pulses. The frequency along pulses is found in the spectrum at that frequency.
 
     Args:
         x: Samples, shape (..., pulse, sample), complex.
@@ -58,7 +58,7 @@ def strongest_tone(x: Tensor, rounds: int = 0) -> Tone:
     n_pulse, n = x.shape[-2:]
     lines = x[..., :: max(1, n_pulse // 128), :]
     power = torch.fft.fft(lines, 2 * n).abs().square().sum(-2)
-    # over eight cells to either side
+    # mean power over eight cells on each side
     half = max(1, min(16, n - 1))
     total = pad(torch.cat([power[..., -half:], power, power[..., :half]], -1), (1, 0)).cumsum(-1)
     around = (total[..., 2 * half + 1 :] - total[..., : -2 * half - 1]) / (2 * half + 1)
@@ -83,7 +83,7 @@ def strongest_tone(x: Tensor, rounds: int = 0) -> Tone:
 
 
 def _offset(x: Tensor) -> Tensor:
-    """Frequency (...,) in cycles per sample of an almost constant x (..., n), from its halves."""
+    """Frequency (...,) in cycles per sample of nearly constant x (..., n), from both halves."""
     half = x.shape[-1] // 2
     turned = x[..., x.shape[-1] - half :].sum(-1) * x[..., :half].sum(-1).conj()
     return turned.angle().to(torch.float64) / (2 * math.pi * max(1, x.shape[-1] - half))

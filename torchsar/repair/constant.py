@@ -1,5 +1,6 @@
-"""Removal of what the receiver adds to every pulse: constants, slow drifts, spurs, and the image of
-unequal I and Q components.
+"""Removal of additive errors of the receiver: constants, slow drifts, spurs and image signals.
+
+An image signal is due to unequal I and Q components.
 """
 
 from __future__ import annotations
@@ -25,13 +26,13 @@ from torchsar.core import (
 from torchsar.core.tone import strongest_tone
 from torchsar.repair.assess import left_out_deviation
 
-# sweeps of a ladar, blocks of its record, dechirped pulses, and channels
+# axes of sweeps of a ladar, of blocks of its record, of dechirped pulses, and of channels
 _ALSO_ON = (("ramp", "pulse", "fast_time"), ("pulse", "time"), ("pulse", "fast_time"), ("channel", "pulse", "range"))
 Of = Literal["recording", "cell", "pulse"]
 
 
 def remove_constant(x: Tensor, of: Of = "recording", degree: int = 0) -> Tensor:
-    """Subtract a constant, or what varies slowly from pulse to pulse.
+    """Subtract a constant, or a value that varies slowly from pulse to pulse.
 
     >>> import torch
     >>> from torchsar import repair
@@ -43,13 +44,13 @@ def remove_constant(x: Tensor, of: Of = "recording", degree: int = 0) -> Tensor:
 
     Args:
         x: Samples, shape (..., pulse, sample), real or complex.
-        of: "recording" subtracts the mean of all samples, such as the offset of a converter, "cell"
-            the mean over pulses of each range or beat cell, such as the leakage of a transmitter or
-            ground at rest, which costs the scene its Doppler about zero, and "pulse" the mean of
-            the samples of each pulse.
-        degree: Degree of the polynomial of the pulse number that is subtracted in place of a
-            constant; of n pulses, degree d removes about d / n cycles per pulse about zero. Without
-            effect for "pulse".
+        of: "recording" subtracts the mean of all samples, such as the offset of a converter.
+            "cell" subtracts the mean over pulses of each range or beat cell, such as the leakage of
+            a transmitter or ground at rest; echoes of the scene about zero Doppler are also
+            removed. "pulse" subtracts the mean of the samples of each pulse.
+        degree: Degree of the polynomial of the pulse number that is subtracted instead of a
+            constant. With n pulses, the degree d removes frequencies up to about d / n cycles per
+            pulse. It has no effect for "pulse".
 
     Returns:
         Samples of the same shape.
@@ -69,7 +70,7 @@ def remove_constant(x: Tensor, of: Of = "recording", degree: int = 0) -> Tensor:
     course = x.mean(-1, keepdim=True) if of == "recording" else x
     basis = legendre(torch.linspace(-1, 1, x.shape[-2], dtype=x.real.dtype, device=x.device), degree)
     weighted = (present * basis).mT
-    # for trials of zeros and for fewer pulses than terms
+    # the ridge is needed for trials of zeros and for fewer pulses than terms
     ridge = 16 * torch.finfo(basis.dtype).eps * x.shape[-2] * torch.eye(degree + 1, dtype=basis.dtype, device=x.device)
     solved = linear_solve((weighted @ basis + ridge).to(x.dtype), weighted.to(x.dtype) @ course)
     return x - present * (basis.to(x.dtype) @ solved)
@@ -95,7 +96,7 @@ class RemoveConstant(Stage):
         super().__init__()
         self.of: Of = of
         self.degree = degree
-        remove_constant(torch.ones(1, 1), of, degree)  # refuses invalid options
+        remove_constant(torch.ones(1, 1), of, degree)  # raises ValueError for invalid options
 
     def forward(self, signal: Signal) -> Signal:
         """Subtract the constant.
@@ -217,7 +218,7 @@ def balance_quadrature(x: Tensor) -> tuple[Tensor, Estimate]:
     gain_db, phase_deg = errors(whole)
     stds = [left_out_deviation(errors(whole[..., None] - part)[..., None])[..., 0] for part in parts]
     std_db, std_deg = torch.maximum(*stds)
-    # the image is half of the relative gain plus half of the phase
+    # relative amplitude of the image signal: half of the gain error and half of the phase error
     image = torch.hypot(std_db * math.log(10) / 20, torch.deg2rad(std_deg)) / 2
     outcome = worst(
         (Outcome.INEXACT, image > 10 ** (-30 / 20)),

@@ -7,7 +7,7 @@ Six questions are asked of any phases, whatever method found them:
 3. Does no block of neighbouring range cells get sharper with phases of its own than noise explains?
 4. How far apart are the phases of two halves of the range cells? This is the standard deviation.
 5. Are the range profiles aligned (`displacement`)?
-6. Does what the phases leave unfocused get sharper with phases of its own (`gain_of_rest`)?
+6. Does the unfocused part of the image get sharper with phases of its own (`gain_of_rest`)?
 """
 
 from __future__ import annotations
@@ -103,8 +103,8 @@ def conclude(
         # The gain was at most 2.2 in 99 % of the correct trials with 3 to 25 points. It exceeded
         # 2.4 in 90 % of the trials in which a vehicle as strong as 30 points moves independently.
         (Outcome.PARTS_DISAGREE, gain > 2.2),
-        # at most 0.9 in right trials of 1 to 100 points, at least 2.0 where a constant, a tone or
-        # ground at rest is stronger than the target
+        # The gain was at most 0.9 in correct trials with 1 to 100 points. It was at least 2.0 where
+        # a constant, a tone or ground at rest is stronger than the target.
         (Outcome.AT_REST, rest > 1.5),
         (Outcome.HOMOGENEOUS, homogeneous > 0),
         # If a gap exceeds this fraction of the record, the phase between the pulses before and

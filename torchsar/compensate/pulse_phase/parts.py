@@ -1,7 +1,7 @@
-"""Does any part of the pulses ask for phases of its own?
+"""Test if a part of the pulses gets sharper with phases of its own than noise would.
 
-A part is a block of neighbouring range cells, or what the phases leave unfocused. A second motion,
-and a scene behind a stronger echo at rest, get sharper with phases of their own than noise does.
+A part is a block of neighbouring range cells, or the energy that the phases leave unfocused. This
+detects a second motion, and a scene that is weaker than an echo at rest.
 """
 
 from __future__ import annotations
@@ -28,18 +28,19 @@ def gain_of_parts(rows: Tensor, present: Tensor, phase: Tensor) -> Tensor:
         The largest gain of three blocks in units of the sharpness that autofocus makes of noise in
         as many range cells, shape (trial,), float64.
     """
-    # more or fewer blocks separate right trials from a second motion less
+    # three blocks separate correct trials best from those with a second motion
     blocks = [_strongest(block, power_of(block)) for block in rows.tensor_split(3, -2) if block.shape[-2]]
     zero = torch.zeros(len(rows), dtype=torch.float64, device=rows.device)
     return torch.stack([zero, *(_gain(block, present, phase, 12)[0] for block in blocks)]).amax(0)
 
 
 def gain_of_rest(rows: Tensor, present: Tensor, phase: Tensor) -> Tensor:
-    """Compute how much sharper what the phases leave unfocused gets with phases of its own.
+    """Compute how much sharper the unfocused part of an image gets with phases of its own.
 
-    The cells of the image that stand out are removed. What remains of right phases is noise, or the
-    weak part of an extended scene. Phases that follow a constant, a tone or ground at rest make
-    these a line within a twelfth of the Doppler band, and what remains is the scene.
+    The unfocused part is what remains of the image after its brightest cells are removed. If the
+    phases are correct, it is noise or the weak part of an extended scene. If the phases follow a
+    constant, a tone or ground at rest, these are focused to a line within a twelfth of the Doppler
+    band, and the scene remains.
 
     Args:
         rows: Pulses, shape (trial, range, pulse), complex.
@@ -48,22 +49,22 @@ def gain_of_rest(rows: Tensor, present: Tensor, phase: Tensor) -> Tensor:
 
     Returns:
         The gain in units of the sharpness that autofocus makes of noise in as many range cells,
-        shape (trial,), float64. It is 0 where most of what stands out is no such line, or where the
-        phases of the rest are as straight as those that were found: it is then the rest that does
-        not move, or both move.
+        shape (trial,), float64. It is 0 where most of the bright energy is not in such a line. It
+        is also 0 where the phases of the remaining part are as linear as the given phases: the
+        remaining part is then at rest, or both parts move.
     """
-    # the side lobes of a strong echo must not be what remains
+    # tapered, so that no side lobes of a strong echo remain
     taper = torch.hann_window(rows.shape[-1], periodic=False, dtype=rows.real.dtype, device=rows.device)
     image = torch.fft.fft(rotate(rows, phase) * taper, norm="ortho")
     power = power_of(image)
-    # one of several rows is enough for the level
+    # some of the rows are enough to estimate the level of noise
     some = power[:, :: max(1, rows.shape[-2] // 64)]
     limit = torch.full_like(some[:, :1, :1], torch.inf)
     for _ in range(6):
         low = some < limit
         limit = 6 * (some * low).sum((-2, -1), keepdim=True) / low.sum((-2, -1), keepdim=True).clamp_min(1)
-    left = power < limit  # of the cells of noise, exp(-6) are higher
-    # the main lobe of the taper is four cells wide
+    left = power < limit  # a cell of noise exceeds the limit with probability exp(-6)
+    # neighbours are removed too, because the main lobe of the taper is four cells wide
     left = left & left.roll(1, -1) & left.roll(-1, -1)
     bright, width = (power * ~left).sum(-2), min(rows.shape[-1], max(8, round(0.08 * rows.shape[-1])))
     near = torch.cat([bright, bright[:, :width]], -1).cumsum(-1)
@@ -72,19 +73,19 @@ def gain_of_rest(rows: Tensor, present: Tensor, phase: Tensor) -> Tensor:
     rest = rotate(torch.fft.ifft(rest, norm="ortho"), -phase) * present[:, None]
     gain, own = _gain(rest, present, phase, 6)
     found, of_rest = (_straightness(at, present) for at in (phase, own))
-    # white phases are all alike, so that a margin decides
+    # the margin is needed because white phases hardly differ in this measure
     moves = 1 - found.square() < 0.9 * (1 - of_rest.square())
     return torch.where(line & moves, gain, 0)
 
 
 def _strongest(rows: Tensor, power: Tensor) -> Tensor:
-    """At most 48 rows (trial, range, pulse) with the most energy."""
+    """Select at most 48 rows (trial, range, pulse) with the most energy."""
     index = power.sum(-1).topk(min(48, rows.shape[-2]), -1).indices
     return rows.gather(-2, index[..., None].expand(-1, -1, rows.shape[-1]))
 
 
 def _gain(rows: Tensor, present: Tensor, phase: Tensor, iterations: int) -> tuple[Tensor, Tensor]:
-    """Gain in sharpness (trial,) of pulses by phases of their own, and these phases."""
+    """Gain in sharpness (trial,) of pulses with phases of their own, and these phases."""
     run = Run(LogAbove(2.5), AlongPulses(), iterations, 1.8, 0.0)
     own = fixed_point(rows, pair_phase(rows, present), run)[0]
     images = (torch.fft.fft(rotate(rows, at), norm="ortho") for at in (own, phase))
@@ -93,6 +94,6 @@ def _gain(rows: Tensor, present: Tensor, phase: Tensor, iterations: int) -> tupl
 
 
 def _straightness(phase: Tensor, present: Tensor) -> Tensor:
-    """Largest share of a phasor (trial, pulse) that one frequency explains, 1 for a line."""
+    """Largest magnitude of the spectrum of exp(j phase), (trial,); 1 for a linear phase."""
     phasor = torch.polar(present.to(phase.dtype), phase)
     return torch.fft.fft(phasor, 2 * phase.shape[-1]).abs().amax(-1) / or_one(present.sum(-1))
