@@ -120,6 +120,12 @@ def test_what_is_at_rest_shows_the_clock_phase():
     torch.testing.assert_close(torch.stack([slope, found["phase_rad"].mean(-1)]), torch.zeros(2, 3).double())
     alone = ClutterSynchronisation(RADAR, 320.0)(drifting.with_data(drifting.data[1]))
     torch.testing.assert_close(alone["phase_rad"], found["phase_rad"][1])
+    delay = 4e-9 * torch.sin(3 * t) + 1e-9
+    late = remove_synchronisation(drifting.data, RADAR, torch.zeros(3, 256), -delay.expand(3, -1))
+    found = ClutterSynchronisation(RADAR, 320.0)(drifting.with_data(late))
+    error, true = found["delay_s"] - (delay - delay.mean()), float(delay.std())
+    assert bool((error.square().mean(-1).sqrt() < 0.25 * true).all()), error.square().mean(-1).sqrt()
+    assert bool((error.square().mean(-1).sqrt() < 3 * found.std["delay_s"][:, 0]).all())
     noise = torch.randn(2, 3, 256, 96, dtype=torch.complex64, generator=torch.Generator().manual_seed(2))
     assert bool(ClutterSynchronisation(RADAR, 320.0)(drifting.with_data(noise)).failed.all())
     with pytest.raises(ValueError, match="must be positive, got 0 Hz and 0.25 s"):

@@ -58,7 +58,7 @@ DIRECT = {
 }
 AT_REST = {
     "drift": {"stage": "clutter_synchronisation", "band_hz": 180.0},
-    "clocks": {"stage": "remove_synchronisation", "uses": {"phase_rad": "drift"}},
+    "clocks": DIRECT["clocks"],
 }
 ERRORS = {
     "channels": {

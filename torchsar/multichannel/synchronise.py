@@ -7,7 +7,8 @@ likelihood for one echo of a known band.
 
 Without a direct path, scatterers at rest determine the phases. A channel passes nearly the places
 at which another one was a pulse before. The channels therefore predict the echo of everything at
-rest from pulse to pulse, whatever the scene is. The remaining phase is the drift of the clocks.
+rest from pulse to pulse, whatever the scene is. The remaining phase and shift in range are the
+drift of the clocks.
 
 Reference:
     Remote Sens. 2020, 12, 1703, sections 1 and 2.1, which describe the direct-path reference
@@ -113,13 +114,14 @@ def estimate_clutter_synchronisation(
     *,
     assess: bool = True,
 ) -> Estimate:
-    """Estimate the clock phase of each pulse from the echo of scatterers at rest.
+    """Estimate the clock phase and delay of each pulse from the echo of scatterers at rest.
 
     Every range cell is weighted, in blocks of slow time, by how well each pulse predicts the next
     one. Bright places at rest, such as islands and ships at anchor, have the most weight, but a sea
     far above the noise contributes as well. Cells in which something moves are badly predicted and
     have hardly any weight. A constant phase cannot be determined, and a phase that grows linearly
-    with time displaces the whole scene along track: both are left out. Not differentiable.
+    with time displaces the whole scene along track: both are left out, and so is a constant delay.
+    Not differentiable.
 
     Args:
         data: Range-compressed, balanced channels with the transmit range removed from the phase,
@@ -131,9 +133,11 @@ def estimate_clutter_synchronisation(
         assess: Whether quality and outcome are assessed.
 
     Returns:
-        `phase_rad` (..., pulse), whose line of least squares is zero, with one standard deviation
-        for all pulses, by what changes without each of four parts of the range cells. Outcomes:
-        `INEXACT` where it exceeds 0.3 rad, `NOISE` where it exceeds 1 rad.
+        `phase_rad` (..., pulse), whose line of least squares is zero, and `delay_s` (..., pulse),
+        whose mean is zero; each with one standard deviation for all pulses, by what changes without
+        each of four parts of the range cells. The delays from pulse to pulse are added up, so that
+        their errors grow with the length of the record. Outcomes: `INEXACT` where the deviation of
+        the phase exceeds 0.3 rad, `NOISE` where it exceeds 1 rad.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -166,22 +170,54 @@ def estimate_clutter_synchronisation(
             # The weight falls with the cube of the error. Otherwise cells that move by a part of a
             # wavelength in a pulse would bias the phases.
             weight = (power - error).clamp_min(0).square() / error.clamp_min(TINY) ** 3
-        phase = _phase_without_line(turn)
+        each = weight[..., block, :]
+        moved, slope = _moved(later * turn.conj()[..., None, :, None], earlier, radar)
+        along, square = each * moved, each * slope
+        value = {"phase_rad": _phase_without_line(turn), "delay_s": _delay(along.sum(-1), square.sum(-1))}
         if not assess:
-            return Estimate({"phase_rad": phase}, outcome=Outcome.NOT_ASSESSED.like(phase[..., 0]))
-        # standard deviation from four parts of the range cells; neighbouring cells, which are
-        # correlated, are in the same part
-        parts, cell = 4, torch.arange(data.shape[-1], device=data.device)
-        sums = torch.zeros(*turn.shape, parts, dtype=product.dtype, device=data.device)
-        sums = sums.index_add(-1, cell // 8 % parts, (weight[..., block, :] * product).to(sums)).movedim(-1, -2)
-        # jackknife: the change when a part is left out, so that a part that dominates counts fully
-        left = sums.sum(-2, keepdim=True) - sums
-        off = _phase_without_line(torch.sgn(left)) - phase[..., None, :]
-        std = (off.square().sum(-2).mean(-1) * ((parts - 1) / parts)).sqrt()
-        std = torch.where((sums == 0).any(-1).any(-1), torch.inf, std).clamp_max(1e3)
-    outcome = worst((Outcome.INEXACT, ~(std <= 0.3)), (Outcome.NOISE, ~(std <= 1.0)))
-    spread = std[..., None].expand_as(phase)
-    return Estimate({"phase_rad": phase}, {"phase_rad": spread}, (1 - std).clamp(0, 1), outcome)
+            return Estimate(value, outcome=Outcome.NOT_ASSESSED.like(turn[..., 0].real))
+        # standard deviations by a jackknife over four parts of the range cells: the change when a
+        # part is left out, so that a part that dominates counts fully
+        sums = [_part_sums(x) for x in (each * product, along, square)]
+        turns, *shifts = (x.sum(-2, keepdim=True) - x for x in sums)
+        left = {"phase_rad": _phase_without_line(torch.sgn(turns)), "delay_s": _delay(*shifts)}
+        off = {name: left[name] - value[name][..., None, :] for name in value}
+        spread = {name: (x.square().sum(-2).mean(-1) * (1 - 1 / x.shape[-2])).sqrt() for name, x in off.items()}
+        blank = (sums[0] == 0).any(-1).any(-1)
+        std = {name: torch.where(blank, torch.inf, x).clamp_max(1e3) for name, x in spread.items()}
+    rad = std["phase_rad"]
+    outcome = worst((Outcome.INEXACT, ~(rad <= 0.3)), (Outcome.NOISE, ~(rad <= 1.0)))
+    every = {name: x[..., None].expand_as(value[name]) for name, x in std.items()}
+    return Estimate(value, every, (1 - rad).clamp(0, 1), outcome)
+
+
+def _part_sums(x: Tensor, parts: int = 4) -> Tensor:
+    """Add values (..., pulse, range) over parts of the range cells, (..., part, pulse).
+
+    Neighbouring cells, which are correlated, are in the same part.
+    """
+    part = torch.arange(x.shape[-1], device=x.device) // 8 % parts
+    sums = torch.zeros(*x.shape[:-1], parts, dtype=x.dtype, device=x.device)
+    return sums.index_add(-1, part, x).movedim(-1, -2)
+
+
+def _moved(later: Tensor, earlier: Tensor, radar: BistaticRadar) -> tuple[Tensor, Tensor]:
+    """Compare pulses with their predictions in range, (..., channel, pulse, range) each.
+
+    The delay of least squares between them is minus the first result over the second one, both
+    summed with weights over range cells, (..., pulse, range). It is small against a range cell.
+    """
+    hertz = radar.range_frequency_hz(later.shape[-1], later.device)
+    rate = torch.where(hertz.abs() <= radar.pulse.bandwidth_hz / 2, 2j * math.pi * hertz, 0).to(later.dtype)
+    slope = torch.fft.ifft(torch.fft.fft((later + earlier) / 2) * rate)
+    return ((later - earlier) * slope.conj()).real.sum(-3), slope.abs().square().sum(-3)
+
+
+def _delay(moved: Tensor, slope: Tensor) -> Tensor:
+    """Add up the delays from pulse to pulse, and remove their mean, (..., pulse) in s."""
+    step = -(moved / slope.clamp_min(TINY)).to(torch.float64)
+    delay = torch.nn.functional.pad(step.cumsum(-1), (1, 0))
+    return delay - delay.mean(-1, keepdim=True)
 
 
 def _phase_without_line(turn: Tensor) -> Tensor:
@@ -303,7 +339,7 @@ class EstimateSynchronisation(ChannelStage):
 
 
 class ClutterSynchronisation(Stage):
-    """Stage that estimates the clock phase of each pulse from the echo of scatterers at rest.
+    """Stage that estimates clock phases and delays from the echo of scatterers at rest.
 
     >>> from torchsar import Draws, echo, multichannel, radar, scene
     >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)
@@ -316,7 +352,8 @@ class ClutterSynchronisation(Stage):
     True
 
     See `estimate_clutter_synchronisation`. It follows the balance of the channels, and the stage
-    that uses it is connected as `use(RemoveSynchronisation(radar), phase_rad="clock")`.
+    that uses it is connected as `use(RemoveSynchronisation(radar), phase_rad="clock",
+    delay_s="clock")`.
 
     Args:
         radar: Radar parameters.
@@ -327,8 +364,8 @@ class ClutterSynchronisation(Stage):
     """
 
     works_on = ("channel", "pulse", "range")
-    provides = ("phase_rad",)
-    neutral = {"phase_rad": 0.0}
+    provides = ("phase_rad", "delay_s")
+    neutral = {"phase_rad": 0.0, "delay_s": 0.0}
     differentiable = "no"
 
     def __init__(
@@ -338,10 +375,10 @@ class ClutterSynchronisation(Stage):
         self.radar, self.settings, self.assess = radar, (band_hz, block_s, snr_db), assess
 
     def forward(self, signal: Signal) -> Estimate:
-        """Estimate the clock phase of each pulse of channels with the axes (channel, pulse, range).
+        """Estimate phase and delay of each pulse of channels with the axes (channel, pulse, range).
 
         Returns:
-            `phase_rad` of shape (..., pulse), see `estimate_clutter_synchronisation`.
+            `phase_rad` and `delay_s` of shape (..., pulse), see `estimate_clutter_synchronisation`.
         """
         return estimate_clutter_synchronisation(signal.data, self.radar, *self.settings, assess=self.assess)
 
