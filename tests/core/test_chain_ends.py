@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+
 import pytest
 import torch
 
@@ -79,3 +81,27 @@ def test_misuse_of_the_ends_is_explained() -> None:
         echo.Simulate(small_radar(), scene.Points([0.0], [0.0]), 8)
     with pytest.raises(ValueError, match="no value 'snr' to connect.*snr_db"):
         Chain(echo=use(echo.Simulate(small_radar(), scene.StripmapWorld(scene.Points([0.0], [0.0])), 8), snr="given.x"))
+
+
+def test_a_stage_of_a_function_holds_connects_and_saves_its_parameters() -> None:
+    def scale(data: torch.Tensor, factor: torch.Tensor, power: torch.Tensor | float = 1.0) -> torch.Tensor:
+        """Scale samples."""
+        return data * factor[..., None, None] ** power
+
+    made = Stage.of(scale)
+    assert (made.__name__, made.__doc__) == ("Scale", "Stage of `scale`.\n\nScale samples.")
+    assert str(inspect.signature(made)) == "(power: 'torch.Tensor | float' = 1.0)"
+    signal, three = small_recording()[0].signal, torch.tensor(3.0)
+    held = made(torch.nn.Parameter(torch.tensor(2.0)))
+    assert [name for name, _ in held.named_parameters()] == ["power"]
+    torch.testing.assert_close(held(signal, factor=three).data, 9 * signal.data)
+    assert list(made(torch.tensor(2.0)).state_dict()) == ["power"]
+    chain = Chain(louder=use(made(), factor="given.factor", power="given.power"))
+    given = {"given.factor": three, "given.power": torch.tensor(2.0)}
+    torch.testing.assert_close(chain(signal, given).data, 9 * signal.data)
+    with pytest.raises(ValueError, match="needs the value 'factor'"):
+        Chain(louder=made(power=2.0))
+    with pytest.raises(TypeError, match="unexpected keyword argument 'gain'"):
+        made(gain=2.0)
+    with pytest.raises(ValueError, match=r"works on the axes \('azimuth',\)"):
+        Stage.of(scale, works_on=("azimuth",))()(signal, factor=three)

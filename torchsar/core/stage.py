@@ -81,6 +81,62 @@ class Stage(nn.Module):
         if "__init__" in vars(cls):
             cls.__init__ = _explained(cls.__init__)
 
+    @classmethod
+    def of(cls, function: Callable[..., Any], **attributes: Any) -> type[Stage]:
+        """Make a stage of a function of samples.
+
+        >>> import torch
+        >>> from torchsar import Axis, Chain, Signal, Stage, use
+        >>> def scale(data, factor, power=1.0):
+        ...     return data * factor**power
+        >>> Scale = Stage.of(scale, works_on=("range",))
+        >>> line = Signal(torch.ones(2, dtype=torch.complex64), (Axis("range", 2, 0.0, 1.0, "m"),))
+        >>> Scale(power=2.0)(line, factor=torch.tensor(3.0)).data.real
+        tensor([9., 9.])
+        >>> louder = Chain(louder=use(Scale(), factor="given.f"))
+        >>> louder(line, {"given.f": torch.tensor(2.0)}).data.real
+        tensor([2., 2.])
+
+        The first parameter of the function takes the samples. Parameters with a default are those
+        of the constructor; the others are values of the call, which a chain connects by `use`, as
+        it can those not given to the constructor. A tensor that the function returns holds the new
+        samples.
+
+        Args:
+            function: Function of samples, shape (..., and the axes), which returns samples or an
+                Estimate.
+            **attributes: Attributes of the stage, such as `works_on` and `provides`.
+
+        Returns:
+            The class of the stage; its name is that of the function without underscores.
+        """
+        accepted = list(inspect.signature(function).parameters.values())[1:]
+
+        def forward(self: Any, signal: Signal, *args: Any, **values: Any) -> Any:
+            held = {name: getattr(self, name) for name in self.constants}
+            found = function(signal.data, *args, **{**held, **values})
+            return signal.with_data(found.contiguous()) if isinstance(found, Tensor) else found
+
+        constructor = inspect.Signature([p for p in accepted if p.default is not p.empty])
+
+        def init(self: Any, *args: Any, **constants: Any) -> None:
+            super(made, self).__init__()
+            self.constants = constructor.bind(*args, **constants).arguments
+            self.connects = [p for p in accepted if p.name not in self.constants]
+            for name, value in self.constants.items():
+                fixed = isinstance(value, Tensor) and not isinstance(value, nn.Parameter)
+                (self.register_buffer if fixed else functools.partial(setattr, self))(name, value)
+
+        init.__annotations__, init.__wrapped__ = function.__annotations__, function  # pyright: ignore
+        called = [inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in ("self", "signal")]
+        forward.__signature__ = inspect.Signature([*called, *accepted])  # pyright: ignore
+        init.__signature__ = inspect.Signature([called[0], *constructor.parameters.values()])  # pyright: ignore
+        about = f"Stage of `{function.__name__}`.\n\n{inspect.getdoc(function) or ''}"
+        attributes |= {"__init__": init, "forward": forward, "__signature__": constructor}
+        attributes |= {"__doc__": about, "__module__": function.__module__}
+        made = type("".join(map(str.capitalize, function.__name__.split("_"))), (cls,), attributes)
+        return made
+
     def __call__(self, signal: Signal, *args: Any, **values: Any) -> Any:
         if torch.compiler.is_dynamo_compiling():
             # local import: it loads torch._dynamo, which takes seconds

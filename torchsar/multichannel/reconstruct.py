@@ -445,7 +445,7 @@ def check_condition(radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild,
     """
     if not isinstance(rebuild, LeastSquares):
         return
-    found = condition_number(radar, motion, rebuild.bands)
+    found = condition_number(radar, motion.each(Tensor.detach), rebuild.bands)
     limit = largest_condition(dtype)
     singular, worst = host_value((found > limit).all(), False), host_largest(found, 0.0)
     if not singular and not worst > POOR:

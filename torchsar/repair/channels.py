@@ -244,22 +244,4 @@ class EstimateImbalance(Stage):
         return estimate_imbalance(signal.data, self.channels, cycles, assess=self.assess)
 
 
-class CorrectImbalance(Stage):
-    """Correction of the imbalance of channels that record the lines in turn.
-
-    In a chain, after a stage of the name "imbalance" that estimates gains and phases:
-    `use(CorrectImbalance(), gain="imbalance", phase_rad="imbalance")`.
-    """
-
-    def forward(self, signal: Signal, gain: Tensor, phase_rad: Tensor) -> Signal:
-        """Remove from each line the gain and phase of its channel; see `correct_imbalance`.
-
-        Args:
-            signal: Raw lines, shape (..., pulse, range).
-            gain: Gain of each channel, shape (..., channel).
-            phase_rad: Phase of each channel in radians, shape (..., channel).
-
-        Returns:
-            Signal with corrected lines.
-        """
-        return signal.with_data(correct_imbalance(signal.data, gain, phase_rad))
+CorrectImbalance = Stage.of(correct_imbalance)

@@ -175,20 +175,7 @@ def band_limited_fill(lines: Tensor, missing: Tensor, rounds: int = 2, steps: in
     return torch.where(mask.mT, (filled * level).mT, lines)
 
 
-class ZeroFill(Stage):
-    """Stage that sets missing lines to zero, the simplest of the fills."""
-
-    def forward(self, signal: Signal, missing: Tensor) -> Signal:
-        """Set missing lines to zero; see `zero_fill`.
-
-        Args:
-            signal: Lines, shape (..., pulse, range).
-            missing: Missing lines, shape (..., pulse), bool.
-
-        Returns:
-            Signal of the same shape.
-        """
-        return signal.with_data(zero_fill(signal.data, missing))
+ZeroFill = Stage.of(zero_fill)
 
 
 class LinearFill(Stage):

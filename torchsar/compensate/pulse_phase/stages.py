@@ -51,24 +51,7 @@ def correct_pulse_phase(data: Tensor, phase_rad: Tensor) -> Tensor:
     return rotate(data.mT, on_the_circle(phase_rad.to(torch.float64)).to(real_dtype(data.dtype))).mT
 
 
-class CorrectPulsePhase(Stage):
-    """Stage that removes the phase `phase_rad` (rad) of every pulse.
-
-    Every pulse is multiplied by exp(-j phase_rad), see `correct_pulse_phase`. The phase usually
-    comes from an earlier stage such as `Autofocus`.
-    """
-
-    def forward(self, signal: Signal, phase_rad: Tensor) -> Signal:
-        """Remove the phase from a signal of axes (pulse, range).
-
-        Args:
-            signal: Pulses, shape (..., pulse, range), complex.
-            phase_rad: Phases in rad, shape (..., pulse).
-
-        Returns:
-            The corrected signal.
-        """
-        return signal.with_data(correct_pulse_phase(signal.data, phase_rad).contiguous())
+CorrectPulsePhase = Stage.of(correct_pulse_phase)
 
 
 class _PhaseEstimator(Stage):

@@ -139,20 +139,4 @@ class PulseGain(Stage):
         return pulse_gain(signal.data, assess=self.assess)
 
 
-class EqualisePulses(Stage):
-    """Stage that divides every pulse by its `gain`; see `equalise_pulses`.
-
-    The gain usually comes from an earlier stage such as `PulseGain`.
-    """
-
-    def forward(self, signal: Signal, gain: Tensor) -> Signal:
-        """Divide the pulses of a signal of axes (pulse, range) by their gains.
-
-        Args:
-            signal: Pulses, shape (..., pulse, range), complex.
-            gain: Gains, shape (..., pulse).
-
-        Returns:
-            The equalised signal.
-        """
-        return signal.with_data(equalise_pulses(signal.data, gain))
+EqualisePulses = Stage.of(equalise_pulses)
