@@ -110,6 +110,7 @@ REASONS: dict[str, str] = {
             "differential_evolution",
             "genetic",
             "grid_search",
+            "implicit",
             "lbfgs",
             "newton",
         )

@@ -248,7 +248,7 @@ class DopplerCentroid(Stage):
     """
 
     provides = ("doppler_hz", "doppler_baseband_hz", "ambiguity", "squint_deg")
-    differentiable = "no"
+    differentiable = "where ok"
 
     def __init__(
         self,
@@ -274,7 +274,6 @@ class DopplerCentroid(Stage):
         nominal = torch.tensor(nominal_doppler(radar)["doppler_hz"], dtype=torch.float64)
         self.neutral = {name: float(value) for name, value in self._values(nominal).items()}
 
-    @torch.no_grad()
     def forward(self, signal: Signal) -> Estimate:
         """Estimate the absolute Doppler centroid of a signal of axes (pulse, range).
 
@@ -304,7 +303,8 @@ class DopplerCentroid(Stage):
         products, power = lag_products(raw, self.blocks)
         base = wrapped(prf / (2 * math.pi) * torch.angle(products.sum((-2, -1))), prf)
         turns = torch.arange(-self.reach, self.reach + 1, dtype=torch.float64, device=raw.device)
-        evidence = ambiguity_evidence(raw, radar, base, reference_spectrum(radar, self.reference, raw), turns)
+        with torch.no_grad():
+            evidence = ambiguity_evidence(raw, radar, base, reference_spectrum(radar, self.reference, raw), turns)
         joint = evidence["looks"] + evidence["lines"] + evidence["entropy"]
         best, nominal = turns[joint.argmax(-1)], radar.pointing_doppler_hz
         if nominal is not None:

@@ -185,7 +185,7 @@ def column_signal(lines: Tensor) -> Tensor:
     Returns:
         The energy above the background, in units of the background, shape (..., range), float64.
     """
-    energy = power_of(lines.detach()).sum(-2).to(torch.float64)
+    energy = power_of(lines).sum(-2).to(torch.float64)
     floor = energy.kthvalue(max(1, energy.shape[-1] // 10), dim=-1, keepdim=True).values
     floor = torch.maximum(floor, 1e-3 * energy.amax(-1, keepdim=True))
     excess = energy / torch.where(floor > 0, floor, 1) - 1 - 4 / math.sqrt(lines.shape[-2])

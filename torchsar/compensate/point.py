@@ -187,14 +187,13 @@ class PointDoppler(Stage):
 
     works_on = ("azimuth", "range")
     provides = ("doppler_hz", "doppler_baseband_hz")
-    differentiable = "no"
+    differentiable = "where ok"
 
     def __init__(self, radar: StripmapRadar, crossing_s: float | None = None, assess: bool = True) -> None:
         super().__init__()
         self.radar, self.crossing_s, self.assess = radar, crossing_s, assess
         self.neutral = nominal_doppler(radar)
 
-    @torch.no_grad()
     def forward(self, signal: Signal, frame_hz: Tensor | None = None, velocity_m_s: Tensor | None = None) -> Estimate:
         """Estimate the Doppler centroid from an image of axes (azimuth, range).
 

@@ -38,6 +38,7 @@ from torchsar.core import (
     unit_level,
 )
 from torchsar.focus.omega_k import OmegaK
+from torchsar.optim import implicit
 from torchsar.optim.scalar import grid_minimum, parabola_minimum, vertex
 from torchsar.radar import StripmapRadar
 
@@ -68,9 +69,8 @@ def _nominal(group: RangeGroup, doppler_hz: Tensor, dwell_s: float) -> tuple[Bea
     block).
     """
     spectrum, radar = beam_spectrum(replace(group, data=unit_level(group.data)), doppler_hz), group.radar
-    with torch.no_grad():
-        image = spectrum.image(doppler_hz, radar.velocity_m_s)
-        return spectrum, image, block_weights(image, radar, doppler_hz, dwell_s)
+    image = spectrum.image(doppler_hz, radar.velocity_m_s)
+    return spectrum, image, block_weights(image, radar, doppler_hz, dwell_s)
 
 
 def _objective(spectrum: BeamSpectrum, doppler_hz: Tensor, weight: Tensor) -> Callable[[Tensor], Tensor]:
@@ -115,7 +115,7 @@ def grid_step_m_s(radar: StripmapRadar, range_m: float, dwell_s: float) -> float
     return 2 * radar.wavelength_m * range_m / (radar.velocity_m_s * dwell_s**2)
 
 
-@differentiable("no")
+@differentiable("where ok")
 def minimum_entropy_velocity(
     group: RangeGroup,
     doppler_hz: Tensor,
@@ -174,28 +174,30 @@ def minimum_entropy_velocity(
     step = grid_step_m_s(group.radar, float(group.radar.near_range_m), dwell_s)
     start = torch.full(doppler_hz.shape, nominal, dtype=torch.float64, device=doppler_hz.device)
     reach, known = min(reach_m_s, nominal / 2), (block_entropy(image) * weight).sum(-1)
-    value, near, inside, costs = _search(spectrum, doppler_hz, weight, start, known, reach, step)
+    with torch.no_grad():
+        value, near, inside, costs = _search(spectrum, doppler_hz, weight, start, known, reach, step)
     # The refinement stops at this share of the step of the grid, a sixth of the half width of the
     # last parabola. With half of that half width, estimates in speckle were displaced by 0.02 m/s.
     tolerance = max(tolerance_m_s, step / 60)
     if near > tolerance:
         value, _ = parabola_minimum(objective, value, near, tolerance)
     value, _ = settle(value, nominal)
+    value = implicit(lambda x, *data: objective(x[..., 0]), value[..., None], group, doppler_hz)[..., 0]
+    half = min(step, nominal / 2) / 10
+    parts = [_parts(spectrum, doppler_hz, weight, value + side * half) for side in (-1, 0, 1)]
+    rows, (low, middle, high), shares = zip(*parts, strict=True)
+    curvature = (low - 2 * middle + high).sum((-2, -1)) / half**2
+    # energy that moves from one part to another, which does not change the entropy by itself,
+    # is left out
+    level = middle.sum(-1, keepdim=True) / shares[1].sum(-1, keepdim=True).clamp_min(1e-300)
+    slope = (high - low - level * (shares[2] - shares[0])) / (2 * half)
+    # the step leads to the vertex of the parabola, and at most to its ends
+    value = value - quotient(slope.sum((-2, -1)), curvature).clamp(-half, half)
+    points = nominal + torch.linspace(-reach, reach, costs.shape[-1], dtype=torch.float64, device=start.device)
+    found = Estimate({"velocity_m_s": value}, info={"grid_velocity_m_s": points, "grid_entropy": costs})
+    if not assess:
+        return found
     with torch.no_grad():
-        half = min(step, nominal / 2) / 10
-        parts = [_parts(spectrum, doppler_hz, weight, value + side * half) for side in (-1, 0, 1)]
-        rows, (low, middle, high), shares = zip(*parts, strict=True)
-        curvature = (low - 2 * middle + high).sum((-2, -1)) / half**2
-        # energy that moves from one part to another, which does not change the entropy by itself,
-        # is left out
-        level = middle.sum(-1, keepdim=True) / shares[1].sum(-1, keepdim=True).clamp_min(1e-300)
-        slope = (high - low - level * (shares[2] - shares[0])) / (2 * half)
-        # the step leads to the vertex of the parabola, and at most to its ends
-        value = value - quotient(slope.sum((-2, -1)), curvature).clamp(-half, half)
-        points = nominal + torch.linspace(-reach, reach, costs.shape[-1], dtype=torch.float64, device=start.device)
-        found = Estimate({"velocity_m_s": value}, info={"grid_velocity_m_s": points, "grid_entropy": costs})
-        if not assess:
-            return found
         minimum = objective, weight, inside, step
         return velocity_assess.assessed(found, spectrum.group, image, minimum, rows, half, slope, curvature)
 
@@ -280,7 +282,7 @@ class EffectiveVelocity(Stage):
 
     provides = ("velocity_m_s",)
     takes_empty = False
-    differentiable = "no"
+    differentiable = "where ok"
 
     def __init__(
         self,
@@ -320,7 +322,7 @@ class EffectiveVelocity(Stage):
         """
         pointing = self._focuser[0].radar.pointing_doppler_hz or 0.0
         given = torch.as_tensor(pointing if doppler_hz is None else doppler_hz, dtype=torch.float64, device=raw.device)
-        return given.detach().expand(raw.shape[:-2])
+        return given.expand(raw.shape[:-2])
 
     def forward(self, signal: Signal, doppler_hz: Tensor | None = None) -> Estimate:
         """Estimate the effective velocity of a signal of axes (pulse, range).
@@ -344,7 +346,7 @@ class EffectiveVelocity(Stage):
             so that every target is cut; and INEXACT where the standard deviation exceeds that
             eighth.
         """
-        (group, dwell), doppler = self.group(signal.data.detach()), self._doppler(signal.data, doppler_hz)
+        (group, dwell), doppler = self.group(signal.data), self._doppler(signal.data, doppler_hz)
         found = minimum_entropy_velocity(group, doppler, dwell, self.reach_m_s, self.tolerance_m_s, assess=self.assess)
         return replace(found, info={**found.info, "group_start": group.start})
 
@@ -361,6 +363,6 @@ class EffectiveVelocity(Stage):
         Returns:
             The entropy in nats, a weighted mean over blocks of range cells, shape (..., n).
         """
-        (group, dwell), doppler = self.group(signal.data.detach()), self._doppler(signal.data, doppler_hz)
+        (group, dwell), doppler = self.group(signal.data), self._doppler(signal.data, doppler_hz)
         blocks = velocity_objective(group, doppler, dwell)
         return torch.stack([blocks(v.to(doppler).expand(doppler.shape)).sum(-1) for v in velocity_m_s], -1)

@@ -85,7 +85,6 @@ __all__ = [
     "Alternate",
     "Axis",
     "Chain",
-    "DerivativeWarning",
     "Draws",
     "Estimate",
     "Outcome",

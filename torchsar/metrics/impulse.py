@@ -193,10 +193,11 @@ class _Images:
         Each sample is at the index (height // 2, width // 2) of its neighbourhood. rows, cols and
         image have the shape (n,).
         """
-        every = self.padded.unfold(-2, height, 1).unfold(-2, width, 1)
-        return every[image, rows + self.margin[0] - height // 2, cols + self.margin[1] - width // 2].to(
-            torch.complex128
-        )
+        starts = rows + self.margin[0] - height // 2, cols + self.margin[1] - width // 2
+        down, right = (x[:, None] + torch.arange(n, device=x.device) for x, n in zip(starts, (height, width)))
+        lines = (image * self.padded.shape[-2])[:, None] + down
+        places = lines[:, :, None] * self.padded.shape[-1] + right[:, None, :]
+        return self.padded.take(places).to(torch.complex128)
 
 
 def _brightest(images: _Images, image: Tensor, rows: Tensor, cols: Tensor, reach: list[int]) -> tuple[Tensor, Tensor]:

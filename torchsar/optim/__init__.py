@@ -8,13 +8,14 @@ smooth, few unknowns              `newton`
 noisy, or rough on a small scale  `adam`
 several minima, few unknowns      `grid_search`
 several minima, within bounds     `differential_evolution`, `genetic`
+derivatives of a minimum          `implicit`
 ================================  ===================================
 
 The first three return a `Descent`, the searches a `Searched`.
 """
 
 from torchsar.optim.descent import Descent, adam, lbfgs
-from torchsar.optim.newton import newton
+from torchsar.optim.newton import implicit, newton
 from torchsar.optim.search import Searched, differential_evolution, genetic, grid_search
 
 __all__ = [
@@ -24,6 +25,7 @@ __all__ = [
     "differential_evolution",
     "genetic",
     "grid_search",
+    "implicit",
     "lbfgs",
     "newton",
 ]

@@ -1,13 +1,15 @@
-"""Newton's method with exact second derivatives per trial, damped or plain."""
+"""Newton's method with exact second derivatives per trial, and derivatives of any minimum."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchsar.core import differentiable
+from torchsar.core.derivatives import is_differentiated
 from torchsar.optim.descent import (
     SUFFICIENT,
     Descent,
@@ -114,6 +116,52 @@ def newton(
     return Descent(here.x, here.cost, norm(here.gradient), taken, evaluations, converged, ok)
 
 
+def implicit(objective: Callable[..., Tensor], minimum: Tensor, *data: Any) -> Tensor:
+    """Give a minimum its derivatives by the data, however it was found.
+
+    >>> import torch
+    >>> from torchsar.optim import implicit, lbfgs
+    >>> def cost(x, level):
+    ...     return (x[..., 0] ** 2 - level).square()
+    >>> level = torch.tensor(4.0, requires_grad=True)
+    >>> with torch.no_grad():
+    ...     found = lbfgs(lambda x: cost(x, level), torch.ones(1)).x
+    >>> root = implicit(cost, found, level)[0]  # the square root, by its derivative 1 / 4
+    >>> torch.autograd.grad(root, level)[0]
+    tensor(0.2500)
+
+    The value stays as it is, to the bit. The implicit function theorem gives its derivatives, those
+    of one Newton step -H^-1 gradient at the minimum, with the Hessian H held constant. They are
+    zero in trials in which the Hessian is not positive definite, such as those at the end of a
+    search. If no derivative by the data is asked for, nothing is computed.
+
+    Args:
+        objective: Maps points (..., n) and the data to real costs (...,), each cost from its own
+            trial alone, twice differentiable by autograd.
+        minimum: Points of least cost, shape (..., n).
+        data: Tensors, trees of tensors such as signals, or objects with tensors as attributes, by
+            which derivatives may be asked for.
+
+    Returns:
+        The points, with derivatives by the data in reverse and forward mode.
+
+    Raises:
+        ValueError: If the objective returns another shape or costs without a gradient.
+    """
+    x = minimum.detach()
+    if not is_differentiated(data):
+        return x
+    cost, gradient, hessian = _derivatives(lambda point: objective(point, *data), x)
+    unit = hessian.diagonal(dim1=-2, dim2=-1).abs().clamp_min(torch.finfo(x.dtype).tiny).rsqrt()
+    scaled = unit[..., :, None] * hessian * unit[..., None, :]
+    point = _Point(x, cost, unit * gradient, scaled, torch.isfinite(scaled).all(-1).all(-1))
+    convex = _curvatures(point)[0][..., :1] > 1e3 * torch.finfo(x.dtype).eps
+    eye = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
+    step = _step(point._replace(hessian=torch.where(convex[..., None], scaled, eye)), False)
+    step = torch.where(convex, unit * step, 0)
+    return x + (step - step.detach())
+
+
 class _Point(NamedTuple):
     """A point with its cost, gradient and Hessian, and True where all of them are finite."""
 
@@ -129,6 +177,13 @@ def _evaluated(objective: Objective, x: Tensor) -> _Point:
 
     The trials are independent, so that n backward passes give the Hessians of all of them.
     """
+    cost, gradient, hessian = (value.detach() for value in _derivatives(objective, x))
+    finite = torch.isfinite(cost) & torch.isfinite(gradient).all(-1) & torch.isfinite(hessian).all(-1).all(-1)
+    return _Point(x.detach(), cost, gradient, hessian, finite)
+
+
+def _derivatives(objective: Objective, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Cost and gradient, with derivatives, and Hessian at x (..., n)."""
     with torch.enable_grad():
         x = x.detach().requires_grad_()
         cost = objective(x)
@@ -140,9 +195,7 @@ def _evaluated(objective: Objective, x: Tensor) -> _Point:
             )
         (gradient,) = torch.autograd.grad(cost.sum(), x, create_graph=True)
         hessian = torch.stack([_row(part, x) for part in gradient.unbind(-1)], -2)
-    cost, gradient = cost.detach(), gradient.detach()
-    finite = torch.isfinite(cost) & torch.isfinite(gradient).all(-1) & torch.isfinite(hessian).all(-1).all(-1)
-    return _Point(x.detach(), cost, gradient, 0.5 * (hessian + hessian.mT), finite)
+    return cost, gradient, 0.5 * (hessian + hessian.mT)
 
 
 def _row(part: Tensor, x: Tensor) -> Tensor:

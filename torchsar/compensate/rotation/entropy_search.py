@@ -23,7 +23,8 @@ from torchsar.compensate.rotation.image_entropy import (
 )
 from torchsar.compensate.rotation.motion import Motion, each
 from torchsar.core import Draws, Estimate, Outcome, Signal, Stage, differentiable, worst
-from torchsar.optim import differential_evolution, genetic, grid_search, lbfgs, newton
+from torchsar.core.derivatives import without_derivatives
+from torchsar.optim import differential_evolution, genetic, grid_search, implicit, lbfgs, newton
 from torchsar.radar import InverseRadar
 
 Vector = Sequence[float] | Tensor
@@ -38,7 +39,7 @@ _OPTIONS: dict[str, tuple[str, ...]] = {
 }
 
 
-@differentiable("no")
+@differentiable("where ok")
 def entropy_rotation(
     figure: ImageEntropy, method: Method, where: Sequence[Vector] | Tensor, *, assess: bool = True, **options: Any
 ) -> Estimate:
@@ -66,6 +67,8 @@ def entropy_rotation(
       compensation of the range-dependent phase, this is the second-order method (SM) of Remote
       Sens. 2025, 17, 3447. If the angle of the target is of order 3, SM finds about k1 + k2 T / 2
       instead of k1, with the length T of the aperture.
+
+    The last two have derivatives, the others none.
 
     Args:
         figure: Image entropy as a function of the unknowns of the rotation.
@@ -115,6 +118,14 @@ def entropy_rotation(
         raise ValueError(f"entropy_rotation: method must be one of {', '.join(get_args(Method))}, got {method!r}")
     if method in ("newton", "descent"):
         return _from_start(figure, method, where, assess, **options)
+    with without_derivatives(f"entropy_rotation with method {method!r}", figure):
+        return _searched(figure, method, where, assess, **options)
+
+
+def _searched(
+    figure: ImageEntropy, method: Method, where: Sequence[Vector] | Tensor, assess: bool, **options: Any
+) -> Estimate:
+    """Estimate on a grid or in a box."""
     names = figure.unknowns.names
     try:
         axes = [torch.as_tensor(part, dtype=torch.float64, device=figure.range_m.device) for part in where]
@@ -175,14 +186,15 @@ def _from_start(figure: ImageEntropy, method: Method, start: Any, assess: bool, 
         finite = torch.isfinite(found.cost)
     doubts = Outcome.of(finite & (found.converged | (found.steps < options["steps"])), Outcome.NOT_CONVERGED)
     info = {"evaluations": found.evaluations, "iterations": found.steps, "converged": found.converged}
-    return _estimate(figure, found.x * unit, found.cost, doubts, info, assess)
+    z = implicit(lambda z, *data: figure.single(z * unit), found.x, figure)
+    return _estimate(figure, z * unit, found.cost, doubts, info, assess)
 
 
 def _estimate(
     figure: ImageEntropy, x: Tensor, cost: Tensor, doubts: Tensor, info: dict[str, Tensor], assess: bool
 ) -> Estimate:
     """Make the estimate from the best vectors, their entropies and the doubts of the search."""
-    rotation, cost = figure.turn(x.detach()), cost.detach()
+    rotation, cost = figure.turn(x), cost.detach()
     value = values_of(rotation.omega_rad_s.abs(), rotation.warp_k, rotation.yc_m)
     if not figure.unknowns.range_term:
         value = {name: value[name] for name in value if name not in ("omega_rad_s", "yc_m")}
@@ -245,7 +257,7 @@ class EntropyRotation(Stage):
             method, or the lists have the wrong number of values.
     """
 
-    differentiable = "no"
+    differentiable = "where ok"
 
     def __init__(
         self,
@@ -290,6 +302,7 @@ class EntropyRotation(Stage):
             )
         self.radar, self.objective = radar, objective
         self.method: Method = method
+        self.differentiable = "where ok" if "start" in takes else "no"
         ends = [given.pop(name) for name in ("low", "high", "counts") if name in given]
         if counts is not None:
             if len({len(end) for end in ends}) > 1 or min(counts, default=0) < 1:

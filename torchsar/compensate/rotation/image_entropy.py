@@ -356,10 +356,10 @@ class ImageEntropy:
         )
         self.trials, self.dtype = data.shape[:-2], data.dtype
         unit = unit_level(data)
-        rms = power_of(unit).mean((-2, -1), keepdim=True).sqrt()
+        rms = power_of(unit.detach()).mean((-2, -1), keepdim=True).sqrt()
         # at unit rms, the squares of samples neither underflow nor overflow
         self.rows = (unit / torch.where(rms > 0, rms, 1)).reshape(-1, *data.shape[-2:])
-        known = torch.as_tensor(0.0 if yc_m is None else yc_m, dtype=torch.float64, device=data.device).detach()
+        known = torch.as_tensor(0.0 if yc_m is None else yc_m, dtype=torch.float64, device=data.device)
         self._yc = known.expand(self.trials).reshape(-1)
 
     @staticmethod

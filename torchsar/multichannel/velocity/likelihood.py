@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import take
+from torchsar.core.derivatives import is_differentiated
 from torchsar.multichannel.channels import checked_channels
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture
@@ -33,6 +34,7 @@ from torchsar.multichannel.velocity.model import (
     solved,
 )
 from torchsar.multichannel.velocity.whitening import Whitening
+from torchsar.optim import implicit
 from torchsar.radar import BistaticRadar
 
 
@@ -101,7 +103,11 @@ def maximum_likelihood(
     data = checked_channels(data, radar, "maximum_likelihood")
     problem = PointLikelihood.of(data, radar, start, aperture, unknowns, whitening)
     motion = start.each(lambda value: value.expand(data.shape[:-2]))
-    motion, fit = _climbed(problem.data, problem.fit, motion, unknowns, steps)
+    with torch.no_grad():
+        motion, fit = _climbed(problem.data, problem.fit, motion, unknowns, steps)
+    if is_differentiated(problem, problem.whitening, motion):
+        motion = problem.at_maximum(motion) if steps else motion
+        fit = problem.fit(motion)
     return Found(motion, fit.amplitude, problem.noise_power(fit), problem.covariance(motion, fit), fit.energy, unknowns)
 
 
@@ -156,6 +162,15 @@ class PointLikelihood:
         tilted = self.time_s / self.time_s.abs().amax().clamp_min(TINY) * model
         applied = self.whitening.applied
         return _coloured(self.data, applied(model), applied(tilted), applied(1j * slopes * model[..., None, :, :]))
+
+    def at_maximum(self, motion: PointMotion) -> PointMotion:
+        """Return the motion of highest likelihood with its derivatives by data and settings."""
+
+        def at(x: Tensor) -> PointMotion:
+            return replace(motion, **dict(zip(self.unknowns, x.unbind(-1), strict=True)))
+
+        found = torch.stack([getattr(motion, name) for name in self.unknowns], -1)
+        return at(implicit(lambda x, *data: -self.fit(at(x)).energy, found, self, self.whitening, motion))
 
     def noise_power(self, fit: PointFit) -> Tensor:
         """Return the residual power per sample in the pulses in which the point is illuminated.

@@ -27,7 +27,7 @@ from torchsar.multichannel.velocity.model import (
     round_units,
 )
 from torchsar.multichannel.velocity.recommended import moving_point_velocity
-from torchsar.optim import lbfgs
+from torchsar.optim import implicit, lbfgs
 from torchsar.radar import BistaticRadar
 
 
@@ -111,7 +111,8 @@ def gradient_likelihood(
     found = lbfgs(
         cost, torch.zeros(*data.shape[:-2], len(unknowns), dtype=torch.float64, device=data.device), steps=steps
     )
-    fit = maximum_likelihood(data, radar, there(found.x), aperture, unknowns, steps=0)
+    x = implicit(lambda x, *given: cost(x), found.x, data, start)
+    fit = maximum_likelihood(data, radar, there(x), aperture, unknowns, steps=0)
     outcome = None
     if assess:
         outcome, _ = outcome_of_point(data, radar, fit, aperture, [(Outcome.NOT_CONVERGED, ~found.ok)])
@@ -354,8 +355,6 @@ class GradientVelocity(LikelihoodVelocity):
 
     See `gradient_likelihood`; arguments as those of `LikelihoodVelocity`.
     """
-
-    differentiable = "no"
 
     def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0) -> Estimate:
         """Estimate the parameters that `unknowns` names, near a starting motion.
