@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from torchsar.core import Axis, Signal, Stage, checked_samples, host_value, level_of, power_of
+from torchsar.core.derivatives import is_differentiated
 
 
 def power(image: Tensor) -> Tensor:
@@ -97,7 +98,8 @@ def amplitude(image: Tensor, looks: tuple[int, int] = (1, 1)) -> Tensor:
     """
     image = checked_samples(image, "amplitude", "azimuth, range", real=True, finite=False)
     if image.is_complex() and tuple(looks) == (1, 1):
-        return image.abs()
+        # torch.abs makes a complex copy in between, but has a derivative at zero
+        return image.abs() if is_differentiated(image) else torch.hypot(image.real, image.imag)
     level = level_of(image)
     mean = multilook(image / level, looks) if image.is_complex() else multilook(image, looks)
     root = torch.where(mean <= 0, 0, torch.sqrt(mean.clamp_min(torch.finfo(mean.dtype).tiny)))
