@@ -63,23 +63,24 @@ def lag_products(x: Tensor, blocks: tuple[int, int] = (8, 8)) -> tuple[Tensor, T
             than blocks.
     """
     x = unit_level(checked_samples(x, "lag_products", "pulse, range", finite=False))
-    peak = x.detach().abs().amax((-2, -1), keepdim=True)
-    x = x / torch.where(peak > 0, peak, 1)
     columns = [last - first for first, last in _bounds(x.shape[-1], blocks[1], "range samples")]
-    products, powers = [], []
+    products, powers, peaks = [], [], []
     for first, last in _bounds(x.shape[-2] - 1, blocks[0], "pairs of lines"):
         part = x[..., first : last + 1, :]
         square = power_of(part)
-        present = (square.detach().amax(-1) > 0).to(square.dtype)
+        brightest = square.detach().amax(-1)
+        peaks.append(brightest.amax(-1))
+        present = (brightest > 0).to(square.dtype)
         both = (present[..., :-1] * present[..., 1:])[..., None]
         product = (part[..., :-1, :].conj() * part[..., 1:, :]).sum(-2)
         power = 0.5 * ((square[..., :-1, :] + square[..., 1:, :]) * both).sum(-2)
         for sums, each in ((products, product.to(torch.complex128)), (powers, power.to(torch.float64))):
             sums.append(torch.stack([some.sum(-1) for some in each.split(columns, -1)], -1))
-    return torch.stack(products, -2), torch.stack(powers, -2)
+    peak = torch.stack(peaks).amax(0).to(torch.float64)[..., None, None]
+    scale = 1 / torch.where(peak > 0, peak, 1)
+    return torch.stack(products, -2) * scale, torch.stack(powers, -2) * scale
 
 
-@differentiable("where ok")
 def phase_increment(
     x: Tensor,
     prf_hz: float,
