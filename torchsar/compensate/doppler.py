@@ -70,15 +70,14 @@ def lag_products(x: Tensor, blocks: tuple[int, int] = (8, 8)) -> tuple[Tensor, T
         square = power_of(part)
         brightest = square.detach().amax(-1)
         peaks.append(brightest.amax(-1))
-        present = (brightest > 0).to(square.dtype)
-        both = (present[..., :-1] * present[..., 1:])[..., None]
+        both = ((brightest[..., :-1] > 0) & (brightest[..., 1:] > 0)).to(square.dtype)[..., None]
         product = (part[..., :-1, :].conj() * part[..., 1:, :]).sum(-2)
         power = 0.5 * ((square[..., :-1, :] + square[..., 1:, :]) * both).sum(-2)
         for sums, each in ((products, product.to(torch.complex128)), (powers, power.to(torch.float64))):
             sums.append(torch.stack([some.sum(-1) for some in each.split(columns, -1)], -1))
-    peak = torch.stack(peaks).amax(0).to(torch.float64)[..., None, None]
-    scale = 1 / torch.where(peak > 0, peak, 1)
-    return torch.stack(products, -2) * scale, torch.stack(powers, -2) * scale
+    # the products of zeros are zero whatever they are divided by
+    peak = torch.stack(peaks).amax(0).to(torch.float64)[..., None, None].clamp_min(1e-300)
+    return torch.stack(products, -2) / peak, torch.stack(powers, -2) / peak
 
 
 def phase_increment(
