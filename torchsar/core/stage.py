@@ -132,6 +132,7 @@ class Stage(nn.Module):
         forward.__signature__ = inspect.Signature([*called, *accepted])  # pyright: ignore
         init.__signature__ = inspect.Signature([called[0], *constructor.parameters.values()])  # pyright: ignore
         about = f"Stage of `{function.__name__}`.\n\n{inspect.getdoc(function) or ''}"
+        attributes = {"differentiable": getattr(function, "differentiable", "yes"), **attributes}
         attributes |= {"__init__": init, "forward": forward, "__signature__": constructor}
         attributes |= {"__doc__": about, "__module__": function.__module__}
         made = type("".join(map(str.capitalize, function.__name__.split("_"))), (cls,), attributes)

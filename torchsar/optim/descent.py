@@ -1,7 +1,6 @@
 """Gradient descent of a smooth cost per trial: L-BFGS and Adam.
 
-All trials are evaluated together, but each follows its own search and ends independently of the
-others.
+All trials are evaluated together, but each follows its own search and ends by itself.
 """
 
 from __future__ import annotations
@@ -134,11 +133,14 @@ def lbfgs(
             converged=flat,
             ok=scaled.finite,
         )
-        while bool(state.active.any()):
+        rounds, known, on_host = 0, 0, start.device.type == "cpu"
+        while rounds < known or bool(state.active.any()):
+            # an accelerator waits for each look, which therefore become rarer
+            rounds, known = rounds + 1, known if on_host or rounds < known else 3 * (rounds + 1) // 2
             line, accepted = _probe(state, scaled)
             state = state._replace(search=line, evaluations=state.evaluations + state.active)
             ended = state.active & (accepted | (line.tries >= search))
-            if not bool(ended.any()):
+            if on_host and not bool(ended.any()):
                 continue
             # trials whose line search has ended move to its result and start a new search
             not_finite = ended & ~accepted & torch.isinf(line.high.rise)
@@ -319,10 +321,7 @@ class _State(NamedTuple):
 
 
 def _probe(state: _State, scaled: _Scaled) -> tuple[_Search, Tensor]:
-    """Evaluate the next point of each line search.
-
-    Returns the updated state of the searches, and True where the point is accepted.
-    """
+    """Evaluate the next point of each line search; return the searches, and where it is accepted."""
     search = state.search
     cost, gradient, finite = scaled(_where(state.active, _along(state, search.step), state.x))
     rise = ((cost - state.cost) / scaled.scale).to(state.x.dtype) / search.descent

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import or_one
 from torchsar.compensate.pulse_phase.homogeneous import SPECTRAL_FLOOR, occupied_band, power_groups, smoothed_spectrum
-from torchsar.core import cholesky_factor, cis, fft_lines, linear_solve, matrix_inverse, power_of
+from torchsar.core import cholesky_factor, cis, fft_lines, matrix_inverse, power_of
 
 PRIOR = 3 / math.pi**2  # inverse variance in 1/rad^2 of a phase that is uniform over a turn
 
@@ -331,25 +331,6 @@ def newton(matrix: Tensor, u: Tensor, steps: int = 4) -> Tensor:
         u, value = torch.where(better[:, None], trial, u), torch.where(better, reached, value)
         damping = torch.where(better, damping / 5, damping * 10).clamp(1e-9, 1e3)
     return u
-
-
-def newton_step(matrix: Tensor, u: Tensor) -> Tensor:
-    """Compute a Newton step of the phases that minimise u^H M u, differentiable in M.
-
-    Args:
-        matrix: Hermitian matrices M, shape (trial, pulse, pulse).
-        u: Phases as exp(j phase), shape (trial, pulse).
-
-    Returns:
-        The step in rad, shape (trial, pulse).
-    """
-    turned = u.conj()[..., :, None] * matrix * u[..., None, :]
-    slope = turned.sum(-1)
-    bend = 2 * (turned.real - torch.diag_embed(slope.real)).detach()
-    # the likelihood does not depend on a constant phase, which the ridge keeps at zero
-    ridge = 1e-6 * torch.diagonal(matrix, dim1=-2, dim2=-1).real.mean(-1).detach()
-    eye = torch.eye(u.shape[-1], dtype=torch.float64, device=u.device)
-    return -linear_solve(bend + ridge[:, None, None] * eye, 2 * slope.imag)
 
 
 def deviation(information: Tensor) -> Tensor:

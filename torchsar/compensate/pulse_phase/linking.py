@@ -20,13 +20,13 @@ from torchsar.compensate.pulse_phase.likelihood import (
     deviation,
     lag_sums,
     newton,
-    newton_step,
     rms_of_pulses,
     windowed_spectrum,
 )
 from torchsar.compensate.pulse_phase.linking_assess import Judged, judged, outcome_of
 from torchsar.compensate.pulse_phase.stages import _PhaseEstimatorFromStart
 from torchsar.core import Estimate, Outcome, cis, differentiable
+from torchsar.core.derivatives import without_derivatives
 
 _BLOCK_BYTES = 64 << 20  # largest memory of the working arrays of a block of trials
 
@@ -43,8 +43,7 @@ def link_phases(data: Tensor, *, start: Tensor | None = None, assess: bool = Tru
 
     The scene is speckle with any Doppler spectrum. Its error does not depend on the size or kind of
     the phase errors. The time grows with the cube of the number of pulses, and the memory with its
-    square (200 MB for 1024 pulses). Differentiable: the derivative is that of a Newton step of the
-    phases for the spectra found.
+    square (200 MB for 1024 pulses).
 
     Args:
         data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
@@ -121,8 +120,8 @@ def linked(pulses: Pulses, start: Tensor | None = None, still: bool = False, ass
     def work(part: slice) -> tuple[Tensor, ...]:
         return _linked(rows[part], pulses.present[part], None if start is None else start[part], still, assess)
 
-    gradients = rows.requires_grad and torch.is_grad_enabled()
-    phase, fit, gain, *rest = by_blocks(pulses, work, gradients=gradients, size=size)
+    with without_derivatives("link_phases", pulses):
+        phase, fit, gain, *rest = by_blocks(pulses, work, size=size)
     value = {"phase_rad": phase.reshape(*trials, n).to(rows.real.dtype)}
     info = {"gain_nats": gain.reshape(trials), "fit_nats": fit.reshape(trials)}
     if not assess:
@@ -146,17 +145,12 @@ def _linked(rows: Tensor, present: Tensor, start: Tensor | None, still: bool, as
     The first gain is multiplied by the share of the band that is occupied, the second one by the
     share of the information of the range cells that is independent.
     """
-    with torch.no_grad():
-        scene = Speckle.of(rows.detach(), present)
-        u, fit = _refined(scene, _grown(scene) if start is None else cis(start.to(torch.float64)))
-        gain = scene.gain(u, fit)
-        share = scene.independent_share(u, fit, scene.information_each(fit))
-        found = judged(scene, u, fit, still) if assess else ()
-    phase = torch.angle(u)
-    if rows.requires_grad and torch.is_grad_enabled():
-        step = newton_step(Speckle.of(rows, present).matrix(fit.inverses), u)
-        phase = phase + step - step.detach()
-    return phase, scene.independent * gain, share * gain, *found
+    scene = Speckle.of(rows, present)
+    u, fit = _refined(scene, _grown(scene) if start is None else cis(start.to(torch.float64)))
+    gain = scene.gain(u, fit)
+    share = scene.independent_share(u, fit, scene.information_each(fit))
+    found = judged(scene, u, fit, still) if assess else ()
+    return torch.angle(u), scene.independent * gain, share * gain, *found
 
 
 def _grown(scene: Speckle) -> Tensor:

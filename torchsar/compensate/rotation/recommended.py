@@ -409,7 +409,7 @@ class RotationAutofocus(Stage):
 
     provides = ("phase_rad",)
     neutral = {"phase_rad": 0.0}
-    differentiable = "no"
+    differentiable = "where ok"
 
     def __init__(self, radar: InverseRadar, search: int = 60, polish: int = 20, assess: bool = True) -> None:
         super().__init__()
@@ -460,7 +460,7 @@ class RotationAutofocus(Stage):
         return rotation_autofocus(data, prf_hz, k, phase_rad, **self.options)
 
 
-@differentiable("no")
+@differentiable("where ok")
 def rotation_autofocus(
     data: Tensor,
     prf_hz: float,
@@ -522,6 +522,5 @@ def rotation_autofocus(
     def continued(rows: Tensor, which: Tensor | slice, at: Tensor) -> Tensor:
         return fixed_point(rows, at, replace(runs[1], iterations=6))[0]
 
-    with torch.no_grad():
-        begin = starting_phase(start, pulses, "rotation_autofocus")
-        return conclude(pulses, *find_phases(pulses, find, begin, whole=True), assess, continued, through)
+    begin = starting_phase(start, pulses, "rotation_autofocus")
+    return conclude(pulses, *find_phases(pulses, find, begin, whole=True), assess, continued, through)
