@@ -84,6 +84,7 @@ from torchsar.scene import (
     PathWorld,
     Pattern,
     PlaneGround,
+    PointCloud,
     Points,
     Polynomial,
     PolynomialRotation,
@@ -402,6 +403,12 @@ CASES = (
         Speckle,
         {"count": 7, "azimuth_extent_m": 9.0, "range_extent_m": 40.0},
         {**RECTANGLE, "level_db": LEVELS},
+        (scene_of_points,),
+    ),
+    Case(
+        PointCloud,
+        {"place_m": [[0.0, 0.0], [0.3, 0.2]], "fluctuation": "none"},
+        {"azimuth_m": (-0.5, 0.0, 1.0), "range_m": (-5.0, 0.0, 8.0), "heading_deg": (0.0, 30.0, -90.0)},
         (scene_of_points,),
     ),
     Case(
@@ -794,6 +801,7 @@ NOT_PER_TRIAL = {
         (CircularPath, name): "the nominal path, which all trials share"
         for name in ("radius_m", "height_m", "start_rad", "rate_rad_s")
     },
+    (Scatterers, "height_m"): "heights of the points of a cloud, which all trials share",
     (Jitter, "step_s"): "decides how many numbers are drawn",
     (RandomWalk, "step_s"): "decides how many numbers are drawn",
 }

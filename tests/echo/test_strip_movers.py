@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from torchsar import focus, scene
 from torchsar.core import Draws, Recording, Truth
 from torchsar.data import config_chain
 from torchsar.echo import simulate
+from torchsar.radar import LinearFM, StripmapRadar
 from torchsar.scene.strip import Beam
 
 PULSES, SAMPLES, SPEED = 192, 128, 120.0
@@ -121,3 +123,18 @@ def test_a_config_has_movers_whose_speeds_may_vary(tmp_path: Path) -> None:
     trace = chain.trace(draws=Draws(1, trials=range(2)), given={"given.world.movers.u_r_m_s.0": speed})
     assert trace.truth is not None
     assert torch.equal(trace.truth.values["u_r_m_s"][:, 1], speed)
+
+
+@pytest.mark.parametrize(
+    "place, count", [((0.0, 0.0), 0), ((0.0, 5e3), 1), ((0.0, -5e2), 1), ((5e3, 0.0), 1), ((40.0, 0.0), 0)]
+)
+def test_targets_without_an_echo_are_counted(place: tuple[float, float], count: int) -> None:
+    """Whole echoes end at the edges of the window, and a beam lights a target for a second."""
+    radar = StripmapRadar(3.2e9, LinearFM(40e6, 0.5e-6), 50e6, 400.0, 120.0, 4000.0, pointing_doppler_hz=0.0)
+    both = scene.Points([place[0], 1.0], [place[1], 2.0])
+    _, truth = simulate(radar, scene.StripmapWorld(both, scene.Dwell(1.0)), 256, 256, Draws(1))
+    assert int(truth.values["targets_outside"]) == count
+    alone = scene.StripmapWorld(scene.Points([place[0]], [place[1]]), scene.Dwell(1.0))
+    with pytest.warns(UserWarning, match="no target of the scene is recorded in 1 of 1") if count else nullcontext():
+        recording, _ = simulate(radar, alone, 256, 256, Draws(1))
+    assert bool((recording.signal.data != 0).any()) == (not count)

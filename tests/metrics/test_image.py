@@ -304,3 +304,15 @@ def test_gradients_at_no_error_and_at_zeros_are_finite(measure: Callable[..., Te
     assert image.grad is not None and bool(torch.isfinite(torch.view_as_real(image.grad)).all())
     if scale or measure is correlation:
         assert float(image.grad.abs().max()) < 1e-9
+
+
+def test_places_without_a_point_have_no_widths() -> None:
+    """Side lobes beside a point are no points: what lies beside is stronger."""
+    line = torch.sinc(torch.arange(-64.0, 64.0) / 2)
+    image = Signal(
+        torch.outer(line, line) + 0j, (Axis("azimuth", 128, -64.0, 1.0, "m"), Axis("range", 128, -64.0, 1.0, "m"))
+    )
+    with pytest.warns(UserWarning, match=r"1 of 2 places have no point response: .* widen the search"):
+        found = impulse_response(image, (torch.tensor([0.0, 12.0]), torch.zeros(2)), search_m=3.0)
+    for name, value in found.items():
+        assert torch.isfinite(value.abs()).tolist() == [True, name == "peak" or name.startswith("position")], name

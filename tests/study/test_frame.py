@@ -78,9 +78,12 @@ def _check_methods(tree: dict, trials: int) -> None:
         assert list(method["cases"]) == list(CASES) and not method["failed"] and method["targets_outside"] == []
         assert method["metrics"] == method["cases"]["one"] != method["cases"]["other/two"]
         plain = {key for key in method["metrics"] if not key.endswith("_sd")}
-        spread = {f"{key}_sd" for key in plain - {"ok"}} if trials > 1 else set()
+        # widths of a target that a method did not find are missing, in all trials or in all but one
+        finite = {key for key in plain if key.partition("_")[0] not in ("irw", "pslr", "islr")}
+        finite |= {key.removesuffix("_sd") for key in method["metrics"] if key.endswith("_sd")}
+        spread = {f"{key}_sd" for key in finite - {"ok"}} if trials > 1 else set()
         assert set(method["metrics"]) == plain | spread, name
-        assert all(isinstance(value, (int, float)) for value in method["metrics"].values())
+        assert all(isinstance(value, (int, float, type(None))) for value in method["metrics"].values())
         assert all(case in ("one", "other_two") for case, _, _ in (t.partition("/") for t in method["targets"]))
     best = tree["methods"]["recommended"]
     assert best["metrics"]["ok"] == 1.0 and best["metrics"]["seconds"] > 0 and best["seconds_by_stage"]
@@ -100,7 +103,8 @@ def _check_numbers(system: str, tree: dict, loaded) -> None:
     again = figures_of(batch_of(Bench(case), list(range(tree["trials"])), detail=True))
     for name, metrics in again.items():
         for key, value in summary(metrics).items():
-            assert tree["methods"][name]["metrics"][key] == pytest.approx(value, rel=1e-9, abs=1e-12), (name, key)
+            written = tree["methods"][name]["metrics"][key]
+            assert (np.nan if written is None else written) == pytest.approx(value, rel=1e-9, abs=1e-12, nan_ok=True)
     assert loaded.system is systems[system]
 
 

@@ -104,7 +104,7 @@ def made_of(text: str, **scope: Any) -> Callable:
 def test_a_changed_function_does_not_resume(tmp_path: Path) -> None:
     grid, out = {"a": [1.0]}, tmp_path / "s"
     sweep(made_of("draws.normal('x', ()) * 2"), grid, trials=2, out=out)
-    with pytest.raises(ConfigError, match=r"or trial function .* trial.code was \w+ and is \w+; choose another folder"):
+    with pytest.raises(ConfigError, match=r"trial function, .* trial.code was \w+ and is \w+; choose another folder"):
         sweep(made_of("draws.normal('x', ()) * 3"), grid, trials=4, out=out, resume=True)
     assert read_sweep(out).trials == 2
     assert sweep(made_of("draws.normal('x', ()) * 2"), grid, trials=4, out=out, resume=True).done.all()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -354,6 +355,9 @@ def simulate(
     >>> recording.signal.data.shape, truth.values["crossing_s"]  # of the middle pulse
     (torch.Size([16, 64]), tensor([0.0200], dtype=torch.float64))
 
+    Positions of the scene are zero at the middle of the frame: at the middle pulse, and in the
+    middle of the range window, whose echoes are recorded completely.
+
     Args:
         radar: Radar parameters.
         world: Scene, beam, path, true velocity and Doppler frequency, and signal-to-noise ratio.
@@ -373,7 +377,9 @@ def simulate(
           `u_a_m_s` along the track and `u_r_m_s`, closing positive;
         - shape (...,) or (): the effective velocity `velocity_m_s`; the Doppler frequency
           `doppler_hz` of the beam centre; the standard deviation `noise_std` of the complex noise
-          of a sample;
+          of a sample; and the number `targets_outside` of targets of which no echo is recorded,
+          because they lie outside the range window or are not lit. If these are all of a trial, a
+          warning says so;
         - the true values of each impairment, as "<impairment>.<name>".
 
         The recording `clean` of the truth has the same noise, but no impairments.
@@ -395,6 +401,7 @@ def simulate(
             f"a target lies behind the radar, at a range of {float(placed.closest_m.min()):.4g} "
             "m; range_m counts from the middle of the recorded frame"
         )
+    outside = _outside(placed, world, radar, n_pulse, n_range, velocity)
     echo = stripmap_echo(placed, world, radar, n_pulse, n_range, dtype)
     std = torch.zeros((), dtype=torch.float64, device=device)
     if world.snr_db is not None:
@@ -408,6 +415,7 @@ def simulate(
         "velocity_m_s": torch.as_tensor(velocity, dtype=torch.float64),
         "doppler_hz": torch.as_tensor(doppler, dtype=torch.float64),
         "noise_std": std,
+        "targets_outside": outside.sum(-1),
     }
     if placed.along_m_s is not None and placed.closing_m_s is not None:
         values |= {
@@ -415,6 +423,30 @@ def simulate(
             "u_r_m_s": placed.closing_m_s,
         }
     return recorded(echo, echo, radar.raw_axes(n_pulse, n_range), radar, values, impairments, draws)
+
+
+def _outside(
+    placed: Placed, world: StripmapWorld, radar: StripmapRadar, n_pulse: int, n_range: int, velocity_m_s: Tensor | float
+) -> Tensor:
+    """Find scatterers without a recorded echo at the recorded time nearest to their crossing of the
+    beam centre, bool (..., target); warn if these are all of a trial.
+    """
+    time_s = placed.crossing_s.clamp(0, (n_pulse - 1) / radar.prf_hz)
+    velocity = per_trial(velocity_m_s, 1, time_s)
+    range_m = torch.hypot(placed.closest_m, velocity * (time_s - placed.zero_doppler_s))
+    sample = (range_m - radar.near_range_m) / radar.range_step_m
+    since_s = (time_s - placed.crossing_s)[..., None, :]
+    lit = world.beam.weight(since_s, torch.zeros_like(since_s), velocity[..., None, :])[..., 0, :] > 0
+    outside = (sample <= -radar.pulse_samples) | (sample >= n_range) | ~lit
+    if bool(outside.all(-1).any()):
+        reach_m = max(0, n_range - radar.pulse_samples) / 2 * radar.range_step_m
+        warnings.warn(
+            f"no target of the scene is recorded in {int(outside.all(-1).sum())} of {outside.all(-1).numel()} trials: "
+            f"the window reaches {reach_m:.4g} m to both sides of range_m = 0, and the beam has to light azimuth_m "
+            f"within the {n_pulse / radar.prf_hz:.4g} s of the record",
+            stacklevel=3,
+        )
+    return outside
 
 
 def _refuse_impossible(radar: StripmapRadar, n_range: int, sin_squint: Tensor) -> None:

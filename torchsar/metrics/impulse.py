@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,7 +68,8 @@ def impulse_response(
         For each axis A of the image `irw_A_m` (-3 dB width), `pslr_A_db` (strongest side lobe
         within `sidelobe_nulls`), `islr_A_db` (energy of the side lobes divided by that of the main
         lobe, null to null) and `position_A_m`; and `peak`, the complex interpolated peak. The
-        shapes are those of `at_m` broadcast with the trials.
+        shapes are those of `at_m` broadcast with the trials. Where a side lobe exceeds the peak,
+        there is no point response, and widths and side lobes are NaN; a warning says so.
 
     Raises:
         ValueError: If the signal does not have two axes, is not finite, or a position lies outside
@@ -111,6 +113,15 @@ def impulse_response(
         out[f"pslr_{axis.name}_db"], out[f"islr_{axis.name}_db"] = figures["pslr"], figures["islr"]
         out[f"position_{axis.name}_m"] = axis.start + axis.step * figures["index"]
         out["peak"] = figures["peak"]
+    lost = torch.stack([out[f"pslr_{axis.name}_db"] > 0 for axis in signal.axes]).any(0)
+    if bool(lost.any()):
+        warnings.warn(
+            f"{int(lost.sum())} of {lost.numel()} places have no point response: what lies beside is stronger, and "
+            "their widths and side lobes are NaN; check the coordinates, or widen the search (search_m)",
+            stacklevel=2,
+        )
+        kept = ("peak", *(f"position_{axis.name}_m" for axis in signal.axes))
+        out = {name: value if name in kept else value.masked_fill(lost, torch.nan) for name, value in out.items()}
     return out if per_target else {name: value[..., 0] for name, value in out.items()}
 
 

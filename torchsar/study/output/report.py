@@ -96,10 +96,6 @@ def run_fields(metrics: Mapping[str, Any], columns: Shown, target_columns: Shown
     """
     methods = metrics["methods"]
     best, cases = methods["recommended"], list(methods["recommended"]["cases"])
-    shown = {key: column for key, column in columns.items() if best["metrics"].get(key) is not None}
-    first = best["metrics"]
-    # largest number of metrics above the tables: two rows of four on a wide screen
-    tiles = [(quantity(first[key], c.unit, _sd(first, key)), c.label) for key, c in list(shown.items())[:8]]
     rows = {name: method["cases"] for name, method in methods.items()}
     published = metrics["published"]
     tables = (
@@ -119,7 +115,6 @@ def run_fields(metrics: Mapping[str, Any], columns: Shown, target_columns: Shown
         for name, method in methods.items()
     }
     return {
-        "tiles": tiles,
         "cases": cases,
         "tables": tables,
         "target_tables": _tables({**of_targets, **theory}, target_columns, metrics["published_targets"], "target"),

@@ -138,15 +138,15 @@ class Strip:
 def _images(result: Result) -> Drawn:
     strip = Strip(result)
     shown = strip.images()
+    if len(shown) > 1:
+        caption = f"The same window of every image; 0 dB is one level for all, taken from '{next(iter(shown))}'."
+        yield "methods", "The same scene by every method", caption, plot.images(shown, **strip.scale)
     caption = (
         "The image of the recommended method in the window that the metrics use, in dB. The two axes have one scale "
         "unless the window is too elongated for that."
     )
     title = strip.result.bench.config.processor["recommended"].title or "recommended"
     yield "image", "Focused image", caption, plot.image(shown["recommended"], title=title, **strip.scale)
-    if len(shown) > 1:
-        caption = f"The same window of every image; 0 dB is one level for all, taken from '{next(iter(shown))}'."
-        yield "methods", "The same scene by every method", caption, plot.images(shown, **strip.scale)
 
 
 def _cuts(result: Result) -> Drawn:
