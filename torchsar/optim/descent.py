@@ -321,7 +321,7 @@ class _State(NamedTuple):
 
 
 def _probe(state: _State, scaled: _Scaled) -> tuple[_Search, Tensor]:
-    """Evaluate the next point of each line search; return the searches, and where it is accepted."""
+    """Evaluate the next point of each line search; return searches and acceptances."""
     search = state.search
     cost, gradient, finite = scaled(_where(state.active, _along(state, search.step), state.x))
     rise = ((cost - state.cost) / scaled.scale).to(state.x.dtype) / search.descent
