@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.audit.pulses import aligned
 from torchsar.compensate import (
     AlignEnvelopes,
     ShiftRange,
@@ -18,8 +19,9 @@ from torchsar.compensate import (
     shift_range,
 )
 from torchsar.compensate.envelope_fit import Envelopes, robust_fit
-from torchsar.core import Axis, Chain, Draws, Outcome, Signal, use
+from torchsar.core import Axis, Chain, Draws, Outcome, Recording, Signal, use
 from torchsar.echo import simulate_turntable
+from torchsar.echo.receiver import GateJumps
 from torchsar.focus import CompressDechirped, azimuth_transform
 from torchsar.metrics import entropy
 from torchsar.radar import LIGHT_M_S, InverseRadar
@@ -381,3 +383,15 @@ def test_outcomes_and_values_without_assessment(method, monkeypatch: pytest.Monk
     alone = method(x, assess=False)
     assert bool((alone.outcome == Outcome.NOT_ASSESSED).all()) and not alone.std
     assert torch.equal(alone["shift_cells"], found["shift_cells"])
+
+
+@pytest.mark.parametrize(("cells", "share", "lasting"), [(1.0, 1.0, False), (3.0, 0.1, False), (10.0, 0.05, True)])
+def test_jumps_of_the_range_gate_cost_no_accuracy(cells: float, share: float, lasting: bool) -> None:
+    batch = aligned(10.0, 5.0)(6, 3)
+    recording = Recording(Signal(batch.data, LADAR.raw_axes(*batch.data.shape[-2:])), LADAR)
+    moved, truth = GateJumps(cells, share, lasting)(recording, Draws(4, trials=range(6)))
+    before, after = align_envelopes(batch.data), align_envelopes(moved.signal.data)
+    change = after["shift_cells"] - before["shift_cells"]
+    away = change - truth["shift_cells"]
+    away = away - away.median(-1, keepdim=True).values
+    assert after.ok.all() and away.abs().max() < 0.02

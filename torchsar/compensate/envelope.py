@@ -16,6 +16,7 @@ per sample.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any, Literal, get_args
 
@@ -26,6 +27,9 @@ from torchsar.compensate import envelope_assess
 from torchsar.compensate.envelope_fit import (
     Course,
     Envelopes,
+    centred,
+    gate_jumps,
+    log_likelihood,
     running_shifts,
     single_shifts,
     smooth_shifts,
@@ -107,8 +111,11 @@ def align_envelopes(
     First the drift is found: the straight line of slow time along which the envelopes, smoothed in
     range, add up best. Then each of `passes` rounds estimates the shift of each block of pulses by
     its likelihood, given the mean envelope of the other blocks. A polynomial is fitted to these
-    shifts, robust against blocks that failed. Shifts may cross the ends of the window any number of
-    times, but must not depart from a straight line by half a window. Not differentiable.
+    shifts, robust against blocks that failed. Jumps of the range gate by whole cells between pulses
+    are found from single pulses and kept where they are likelier, from an SNR of about 5 dB per
+    sample on; below that, an alignment with jumps may be ok and wrong. Shifts may cross the ends of
+    the window any number of times, but must not depart from a straight line by half a window. Not
+    differentiable.
 
     On 400 pulses of a simulated aircraft the error of the shifts is 0.02 cell at an SNR of -8 dB
     per sample and above, and 0.05 cell at -12.5 dB. On noise-free data the remaining shifts raise
@@ -173,9 +180,23 @@ def align_envelopes(
     flat, shape = flat.detach(), data.shape[:-2]
     size = flat.shape[1] * flat.shape[2] * flat.element_size()
     parts = flat.split(max(1, 8 * block_bytes_of(flat.device) // max(1, size))) if len(flat) else ()
-    courses = [find(Envelopes.of(part)) for part in parts]
+    parts, courses, jumps = [*parts], [], []
+    for i, part in enumerate(parts):
+        pulses = Envelopes.of(part)
+        smooth, std = find(pulses)
+        jump = torch.zeros_like(smooth) if std is None else gate_jumps(pulses, smooth)
+        if std is not None and bool(jump.any()):
+            without = shift_range(part, -jump)
+            again, std_again = find(Envelopes.of(without))
+            gain = log_likelihood(pulses, again + jump) - log_likelihood(pulses, smooth)
+            better = (gain > math.log(2 * pulses.n) * (jump.diff() != 0).sum(-1))[:, None]
+            smooth, jump = torch.where(better, again, smooth), jump * better
+            std, parts[i] = torch.where(better[:, 0], std_again, std), torch.where(better[..., None], without, part)
+        courses.append((smooth, std))
+        jumps.append(jump)
+    shifts = [course[0] + jump for course, jump in zip(courses, jumps, strict=True)]
     enough = present.sum(-1, keepdim=True) >= 2
-    shift = torch.where(enough, torch.cat([c[0] for c in courses]), 0) if parts else present.double()
+    shift = torch.where(enough, centred(torch.cat(shifts), present), 0) if parts else present.double()
     value, info = {"shift_cells": shift.reshape(data.shape[:-1])}, {"present": present.reshape(data.shape[:-1])}
     found = Estimate(value, quality=shift.new_ones(shape), info=info)
     if not (assess and parts):

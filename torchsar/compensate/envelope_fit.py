@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import legendre, linear_phasor, linear_solve, unit_level, wrapped
+from torchsar.core import host_value, legendre, linear_phasor, linear_solve, true_positions, unit_level, wrapped
 from torchsar.optim.scalar import vertex
 
 _HALF = 2  # samples per range cell, because |s|^2 has twice the band of s
@@ -245,6 +245,51 @@ def smooth_shifts(pulses: Envelopes, degree: int, passes: int, blocks: int) -> t
         shift = shift - shift.mean(-1, keepdim=True)
     residual = (found - (middle @ step[..., None]).squeeze(-1)).abs()
     return shift, robust_std(residual, count > 0).squeeze(-1) * ((degree + 1) / (count > 0).sum(-1).clamp_min(1)).sqrt()
+
+
+def gate_jumps(pulses: Envelopes, smooth: Tensor) -> Tensor:
+    """Find jumps of the range gate by whole cells, beside smooth shifts.
+
+    Where the likeliest place of any pulse is clearly another than the smooth one, the shifts of
+    single pulses are found, and the whole cells of their differences from pulse to pulse add up to
+    the jumps. The fractions of a cell are those of the smooth motion, which near pulses share.
+
+    Args:
+        pulses: Envelopes.
+        smooth: Smooth shifts in cells, shape (trial, pulse).
+
+    Returns:
+        Jumps in whole cells, 0 for the first pulse, shape (trial, pulse), float64.
+    """
+    jumps = torch.zeros_like(smooth)
+    place, gain = _likeliest(pulses, smooth)
+    # noise alone seldom gains this many nats at the likeliest of all places
+    suspect = ((place != 0) & (gain > math.log(2 * pulses.n))).any(-1)
+    at = true_positions(suspect, host_value(suspect.sum(), len(suspect)))
+    if not len(at):
+        return jumps
+    some = Envelopes(pulses.spectra[at], pulses.present[at], pulses.n)
+    single = single_shifts(some, running_shifts(some, 0.1), "likelihood", 4)
+    step = wrapped((single_shifts(some, single, "refined", 2) - smooth[at]).diff(dim=-1), pulses.n)
+    # of 33 pairs of pulses, which is few for any motion and many for the jitter of single shifts
+    both = (some.present[:, 1:] & some.present[:, :-1])[:, None]
+    phasor = torch.stack([torch.cos(2 * math.pi * step), torch.sin(2 * math.pi * step)], -2) * both
+    near = torch.nn.functional.avg_pool1d(phasor, 33, 1, 16)
+    common = torch.atan2(near[:, 1], near[:, 0]) / (2 * math.pi)
+    whole = torch.nn.functional.pad(torch.round(step - common).cumsum(-1), (1, 0))
+    return jumps.index_copy(0, at, whole)
+
+
+def _likeliest(pulses: Envelopes, course: Tensor) -> tuple[Tensor, Tensor]:
+    """Likeliest place in cells, beside shifts (trial, pulse), of each pulse in the mean envelope,
+    and its gain in log-likelihood; 0 for pulses that are not present.
+    """
+    moved = pulses.moved(course)
+    against = pulses.likelihood(moved.sum(-2, keepdim=True) / pulses.count)
+    likely = pulses.on_grid(moved * against.conj()) / _HALF
+    gain, at = (likely - likely[..., :1]).max(-1)
+    place = wrapped(at.to(torch.float64) / _HALF, pulses.n)
+    return torch.where(pulses.present, place, 0), torch.where(pulses.present, gain, 0)
 
 
 def mean_drift(pulses: Envelopes) -> Tensor:
