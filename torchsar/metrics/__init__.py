@@ -3,7 +3,7 @@
 =================================  =================================================================
 to judge                           what to use
 =================================  =================================================================
-any of these at the end of a chain `Measure`
+any of these, ending a chain       `Measure`
 sharpness of an image              `entropy`, `contrast`
 image against a reference          `error_db`; with a free gain `error_after_gain_db`, with a shift
                                    `registered_error_db`; `correlation`
