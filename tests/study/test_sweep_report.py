@@ -16,8 +16,9 @@ from tests.study.scenes import draw_first_panels
 from torchsar.core import Draws, Outcome
 from torchsar.plot import axis_label
 from torchsar.study.montecarlo import sweep
-from torchsar.study.montecarlo.record import Record, Summary, summary_of
+from torchsar.study.montecarlo.record import Record, summary_of
 from torchsar.study.montecarlo.report import SweepPictures, draw_sweep, with_interval, write_sweep_report
+from torchsar.study.montecarlo.summary import Summary
 from torchsar.study.montecarlo.work import BOUNDS
 from torchsar.study.output.numbers import number, write_json
 from torchsar.study.output.report import Picture

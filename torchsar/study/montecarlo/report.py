@@ -15,7 +15,7 @@ from torchsar import plot
 from torchsar.core import Outcome
 from torchsar.metrics.intervals import LEVEL
 from torchsar.plot import axis_label, name_and_unit
-from torchsar.study.montecarlo.record import Summary
+from torchsar.study.montecarlo.summary import Summary
 from torchsar.study.output.numbers import MISSING, number
 from torchsar.study.output.progress import clock
 from torchsar.study.output.report import Drawn, Picture, draw_all, write_page

@@ -29,7 +29,8 @@ from torchsar.core.stored import machine_memory_bytes
 from torchsar.io.seal import SEAL, address, array_metadata, canonical, checksum, document, group_attributes, sealed
 from torchsar.study.montecarlo.fingerprint import changes, short
 from torchsar.study.montecarlo.grid import Grid
-from torchsar.study.montecarlo.record import OUTCOME, Labels, Record, blank
+from torchsar.study.montecarlo.record import OUTCOME, Record, blank
+from torchsar.study.montecarlo.summary import Labels
 from torchsar.study.settings.errors import ConfigError, one_line
 
 # version of the layout of the store; other versions are rejected on resume
