@@ -91,6 +91,7 @@ def test_a_stage_of_a_function_holds_connects_and_saves_its_parameters() -> None
     made = Stage.of(scale)
     assert (made.__name__, made.__doc__) == ("Scale", "Stage of `scale`.\n\nScale samples.")
     assert str(inspect.signature(made)) == "(power: 'torch.Tensor | float' = 1.0)"
+    assert inspect.signature(made.forward).return_annotation is Signal
     signal, three = small_recording()[0].signal, torch.tensor(3.0)
     held = made(torch.nn.Parameter(torch.tensor(2.0)))
     assert [name for name, _ in held.named_parameters()] == ["power"]

@@ -25,8 +25,8 @@ STAGES_IN = (compensate, focus, multichannel, repair, core)
 
 
 def axes(entry: Entry) -> tuple[str, ...]:
-    """Names of the axes of the samples of an entry."""
-    return _signal(entry.kind).names
+    """Names of the axes of the samples of an entry, of which Doppler stands for the pulses."""
+    return tuple("pulse" if name == "doppler" else name for name in _signal(entry.kind).names)
 
 
 def draw(entry: Entry, seed: int, trials: int = 1) -> Tensor:

@@ -23,6 +23,7 @@ from tests.table.stages import (
     LINE_NUMBER,
     LIT,
     NEW_AXIS,
+    ON_DOPPLER,
     ON_RANGE,
     RADAR,
     RANGE_FREE,
@@ -613,6 +614,7 @@ FUNCTIONS = [
             "doppler",
             lambda s: multichannel.focus_azimuth(s.data, s.axes[-1].values(), BISTATIC, motion(s.data), 300.0),
         ),
+        laws=Laws(pulse=ON_DOPPLER),
     ),
     _entry(
         "multichannel.body.find_body",

@@ -552,7 +552,13 @@ CASES = [
         channels="range",
         laws=Laws(pulse=NEW_AXIS),
     ),
-    Case("focus_azimuth", lambda: multichannel.FocusAzimuth(BISTATIC, bandwidth_hz=300.0), _motion, channels="doppler"),
+    Case(
+        "focus_azimuth",
+        lambda: multichannel.FocusAzimuth(BISTATIC, bandwidth_hz=300.0),
+        _motion,
+        channels="doppler",
+        laws=Laws(pulse=ON_DOPPLER),
+    ),
     Case(
         "focus_plan",
         lambda: multichannel.FocusPlan(BISTATIC, bandwidth_hz=300.0, u_r_m_s=5.0, u_a_m_s=2.0),

@@ -110,7 +110,8 @@ class Stage(nn.Module):
         Returns:
             The class of the stage; its name is that of the function without underscores.
         """
-        accepted = list(inspect.signature(function).parameters.values())[1:]
+        known = inspect.signature(function)
+        accepted = list(known.parameters.values())[1:]
 
         def forward(self: Any, signal: Signal, *args: Any, **values: Any) -> Any:
             held = {name: getattr(self, name) for name in self.constants}
@@ -129,7 +130,9 @@ class Stage(nn.Module):
 
         init.__annotations__, init.__wrapped__ = function.__annotations__, function  # pyright: ignore
         called = [inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in ("self", "signal")]
-        forward.__signature__ = inspect.Signature([*called, *accepted])  # pyright: ignore
+        returned = Signal if known.return_annotation in (Tensor, "Tensor", "torch.Tensor") else known.return_annotation
+        forward.__annotations__["return"] = returned
+        forward.__signature__ = inspect.Signature([*called, *accepted], return_annotation=returned)  # pyright: ignore
         init.__signature__ = inspect.Signature([called[0], *constructor.parameters.values()])  # pyright: ignore
         about = f"Stage of `{function.__name__}`.\n\n{inspect.getdoc(function) or ''}"
         attributes = {"differentiable": getattr(function, "differentiable", "yes"), **attributes}
