@@ -808,7 +808,6 @@ NOT_PER_TRIAL = {
         (CircularPath, name): "the nominal path, which all trials share"
         for name in ("radius_m", "height_m", "start_rad", "rate_rad_s")
     },
-    (Scatterers, "height_m"): "heights of the points of a cloud, which all trials share",
     (Jitter, "step_s"): "decides how many numbers are drawn",
     (RandomWalk, "step_s"): "decides how many numbers are drawn",
 }
