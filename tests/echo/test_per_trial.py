@@ -394,12 +394,6 @@ CASES = (
         (scene_of_points, scene_beyond_the_line),
     ),
     Case(
-        PointCloud,
-        {"place_m": [[0.0, 0.0], [1.0, 9.0]]},
-        {"azimuth_m": (0.0, 2.0, -1.0), "range_m": (0.0, 90.0, -20.0), "heading_deg": (0.0, 30.0, -10.0)},
-        (scene_of_points, scene_beyond_the_line),
-    ),
-    Case(
         RandomPoints,
         {"count": 5, "azimuth_extent_m": 9.0, "range_extent_m": 40.0},
         {**RECTANGLE, "spread_db": LEVELS},
@@ -791,7 +785,6 @@ FACTORIES = (
 
 # parameters annotated with Tensor that have no case, and plain numbers, each with the reason
 NOT_PER_TRIAL = {
-    (Scatterers, "height_m"): "made by scenes, whose classes have cases",
     (MeasuredTrack, "time_s"): "times of measurement, which all trials share",
     (RecordedPath, "start_s"): "time of the log at the first pulse, which all trials share",
     (Navigation, "rate_hz"): "decides how many records there are",

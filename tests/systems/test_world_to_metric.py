@@ -15,6 +15,9 @@ from torch import Tensor
 from torchsar import Draws
 from torchsar.core import Trace
 from torchsar.data import config_chain
+from torchsar.study.settings.errors import ConfigError
+from torchsar.study.table import load
+from torchsar.study.trials.bench import Bench
 
 PAGE = Path(__file__).parents[2] / "docs" / "how_to" / "world_to_metric.md"
 SYSTEMS = ("stripmap", "path", "geo", "geo_ocean", "isal", "isal_rotation", "sal")
@@ -220,3 +223,25 @@ def test_the_same_chain_as_a_config_gives_the_same_bits(system: str, tmp_path: P
     assert torch.equal(found.metrics["entropy"], own.metrics["entropy"])
     for name in stages:
         assert torch.equal(found.outputs[name].data, own.outputs[name].data)
+
+
+def test_what_a_config_measures_are_metrics_of_the_method(tmp_path: Path) -> None:
+    radar, world, stages, _ = CONFIGS["isal"]
+    error = {"estimate_rad": "phase.phase_rad", "reference_rad": "truth.start.phase_rad"}
+    measured = {
+        "entropy": {"stage": "measure", "metric": "entropy"},
+        "error": {"stage": "measure", "metric": "phase_rmse", "uses": error},
+    }
+    tree = {"title": "measured", "system": "isal", "radar": radar, "world": {**world, "noise": {"snr_db": 20.0}}}
+    tree["processor"] = {"recommended": {"stages": {**stages, **measured}}}
+    file = tmp_path / "measured.yaml"
+    file.write_text(yaml.safe_dump(tree, sort_keys=False), encoding="utf-8")
+    bench = Bench(load(file))
+    metrics = bench.batch(bench.draws("run", range(3)), detail=True).outcomes["recommended"].metrics
+    assert torch.equal(metrics["entropy"], metrics["entropy_nats"])
+    torch.testing.assert_close(metrics["error"], metrics["residual_phase_rms_rad"])
+    # other stages may not use true values
+    tree["processor"]["recommended"]["stages"]["correct"]["uses"] = {"phase_rad": "truth.start.phase_rad"}
+    file.write_text(yaml.safe_dump(tree, sort_keys=False), encoding="utf-8")
+    with pytest.raises(ConfigError, match="oracle: true"):
+        Bench(load(file))
