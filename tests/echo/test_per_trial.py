@@ -785,6 +785,7 @@ FACTORIES = (
 
 # parameters annotated with Tensor that have no case, and plain numbers, each with the reason
 NOT_PER_TRIAL = {
+    (Scatterers, "height_m"): "heights of the points of a cloud, which all trials share",
     (MeasuredTrack, "time_s"): "times of measurement, which all trials share",
     (RecordedPath, "start_s"): "time of the log at the first pulse, which all trials share",
     (Navigation, "rate_hz"): "decides how many records there are",
