@@ -23,8 +23,8 @@ path of an antenna                `StraightPath`, `CircularPath`, `RecordedPath`
 point targets                     `Points`, `RandomPoints`; `PointCloud` of an array or an image;
                                   `Together` joins a `Scene` with others; they become `Scatterers`
 surface                           `Speckle`, `KSea`, `ImageReflectivity`
-moving points and ships           `MovingPoints`, `Ship`, `GroundMovers`; `Fleet` joins them; of strips
-                                  as `movers` of a `StripmapWorld`
+moving points and ships           `MovingPoints`, `Ship`, `GroundMovers`; `Fleet` joins them; for
+                                  strips they are `movers` of a `StripmapWorld`
 models of targets                 `Aircraft`, `Satellite`, `SpreadRows`, `LetterE`,
                                   `RetroAndBrokenLine`
 motion along the line of sight    `Motion`: `Polynomial`, `Sinusoid`, `VibrationSpectrum`,
