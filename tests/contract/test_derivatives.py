@@ -11,10 +11,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.table.functions import ENTRIES, Entry, named, samples
+from tests.table.functions import ENTRIES, Entry, named, samples, tile_plan
 from tests.table.numbers import NUMBERS
 from tests.table.stages import CASES, Case, entering, raw
+from torchsar.compensate import autofocus
 from torchsar.core import DerivativeWarning, Estimate, Stage
+from torchsar.metrics import entropy
+from torchsar.optim import implicit
 
 Results = dict[str, Tensor]
 
@@ -133,3 +136,32 @@ def test_functions_of_numbers(name: str) -> None:
             continue  # a number
         single = any(y.dtype in (torch.float32, torch.complex64) for y in values_of(out).values())
         check(declared(name), lambda x, key=key: call(**{**given, key: x}), {"x": x}, 1, 1e3 if single else 1)
+
+
+def test_torch_func_differentiates_images_of_moved_tiles() -> None:
+    x, plan = samples("raw", 2, torch.complex128), tile_plan(48, 64)
+    place, reference = plan.antennas.transmitter_m, plan.antennas.reference_m
+
+    def cost(offset: Tensor, history: Tensor) -> Tensor:
+        return entropy(plan.moved(place + offset, None, reference).image(history))
+
+    offset = torch.zeros_like(place).requires_grad_()
+    (wanted,) = torch.autograd.grad(cost(offset, x[0]), offset)
+    torch.testing.assert_close(torch.func.grad(cost)(offset.detach(), x[0]), wanted)
+    with pytest.raises(RuntimeError, match="vmap cannot map plans of tiles.* leading dimension"):
+        torch.vmap(cost)(torch.zeros(2, *place.shape, dtype=torch.float64), x)
+
+
+def test_vmap_refuses_estimators_of_phases_in_one_sentence() -> None:
+    with pytest.raises(RuntimeError, match="vmap cannot map estimators of phases.* leading dimensions"):
+        torch.vmap(lambda x: autofocus(x)["phase_rad"])(samples("raw", 2, torch.complex128))
+
+
+def test_minima_refuse_torch_func_in_one_sentence() -> None:
+    data = torch.tensor([4.0, 9.0], dtype=torch.float64)
+
+    def root(data: Tensor) -> Tensor:
+        return implicit(lambda x, d: (x[..., 0].square() - d).square(), data.detach().sqrt()[:, None], data).sum()
+
+    with pytest.raises(RuntimeError, match="use torch.autograd.grad"):
+        torch.func.grad(root)(data)

@@ -55,6 +55,7 @@ from torchsar.core.host import (
     host_largest,
     host_value,
     host_values,
+    is_hidden,
     is_out_of_memory,
     is_traced,
     level_of,

@@ -162,6 +162,18 @@ def untraced(*given: Tensor | float | None) -> Iterator[None]:
         yield
 
 
+def is_hidden(x: Tensor) -> bool:
+    """Find out whether `torch.func.vmap` hides the values of a tensor.
+
+    Args:
+        x: Tensor, not empty.
+
+    Returns:
+        True inside vmap, where the tensor stands for many trials.
+    """
+    return _is_mapped(x) and _read(x.detach().flatten()[:1]) is None
+
+
 def check_value(x: Tensor, check: Check) -> None:
     """Check the numbers in a small tensor: at once, or in `gathered_checks` perhaps later.
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchsar.core import differentiable
+from torchsar.core import differentiable, is_plain
 from torchsar.core.derivatives import is_differentiated
 from torchsar.optim.descent import (
     SUFFICIENT,
@@ -146,11 +146,17 @@ def implicit(objective: Callable[..., Tensor], minimum: Tensor, *data: Any) -> T
         The points, with derivatives by the data in reverse and forward mode.
 
     Raises:
+        RuntimeError: If a derivative is asked for by a transform of torch.func.
         ValueError: If the objective returns another shape or costs without a gradient.
     """
     x = minimum.detach()
     if not is_differentiated(data):
         return x
+    if x.numel() and not is_plain(x):
+        raise RuntimeError(
+            "derivatives of a minimum are not found inside transforms of torch.func; use torch.autograd.grad, backward "
+            "or forward-mode tangents"
+        )
     cost, gradient, hessian = _derivatives(lambda point: objective(point, *data), x)
     unit = hessian.diagonal(dim1=-2, dim2=-1).abs().clamp_min(torch.finfo(x.dtype).tiny).rsqrt()
     scaled = unit[..., :, None] * hessian * unit[..., None, :]

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import block_bytes_of, checked_samples, cis, over_blocks, unit_level
+from torchsar.core import block_bytes_of, checked_samples, cis, is_hidden, over_blocks, unit_level
 
 
 @dataclass(frozen=True)
@@ -162,6 +162,11 @@ def by_blocks(
         The tensors of all trials.
     """
     rows, done = pulses.rows, {}
+    if rows.numel() and is_hidden(rows):
+        raise RuntimeError(
+            "torch.func.vmap cannot map estimators of phases, whose iterations end by trial; give all trials as "
+            "leading dimensions, (..., pulse, range), in one call"
+        )
     if size is None:
         size = max(1, block_bytes_of(rows.device) // max(1, rows[:1].numel() * rows.element_size()))
     size = max(1, len(rows)) if whole else size

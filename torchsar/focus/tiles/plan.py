@@ -12,7 +12,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from torchsar.core import checked_samples, is_traced, untraced
+from torchsar.core import checked_samples, is_hidden, is_traced, untraced
 from torchsar.focus.backprojection import direct_sum, expanded_history
 from torchsar.focus.image_grid import ImageGrid
 from torchsar.focus.tiles.choice import Choice
@@ -263,6 +263,11 @@ def _refuse_traced(*known: Tensor | None) -> None:
         raise ValueError(
             "the sizes of tiles depend on the values of positions and frequencies, which must be constants of a traced "
             "program; let it depend on the history alone, or use backproject"
+        )
+    if any(v is not None and is_hidden(v) for v in known):
+        raise RuntimeError(
+            "torch.func.vmap cannot map plans of tiles, whose sizes depend on the values of positions and frequencies; "
+            "give the paths as a leading dimension of the positions, or map over the history alone, or use backproject"
         )
 
 

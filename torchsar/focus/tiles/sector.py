@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from torchsar.core import block_bytes_of, over_blocks, untraced
+from torchsar.core import block_bytes_of, is_plain, over_blocks, untraced
 from torchsar.focus.image_grid import ImageGrid
 from torchsar.focus.tiles.choice import choose, error_db
 from torchsar.focus.tiles.expansion import slopes
@@ -196,6 +196,7 @@ class Sector:
         # computed again in the backward pass.
         linear = trials <= _GROUP and not any(v.requires_grad for v in given[1:])
         linear = linear and self._tables.fits(data.dtype) and self._weights.fits(data.dtype)
+        linear = linear or not all(map(is_plain, given))  # torch.func takes no checkpoints
         pixels = self._pixels if linear else partial(checkpoint, self._pixels, use_reentrant=False)
         count = 0 if grad else math.prod(self._tiles)
         tiles = data.new_empty(count, paths * trials, *self._size)
