@@ -113,9 +113,9 @@ def align_envelopes(
     its likelihood, given the mean envelope of the other blocks. A polynomial is fitted to these
     shifts, robust against blocks that failed. Jumps of the range gate by whole cells between pulses
     are found from single pulses and kept where they are likelier, from an SNR of about 5 dB per
-    sample on; below that, an alignment with jumps may be ok and wrong. Shifts may cross the ends of
-    the window any number of times, but must not depart from a straight line by half a window. Not
-    differentiable.
+    sample on. Below that, and where more than four scatterers share each range cell, an alignment
+    with jumps may be ok and wrong. Shifts may cross the ends of the window any number of times, but
+    must not depart from a straight line by half a window. Not differentiable.
 
     On 400 pulses of a simulated aircraft the error of the shifts is 0.02 cell at an SNR of -8 dB
     per sample and above, and 0.05 cell at -12.5 dB. On noise-free data the remaining shifts raise
@@ -180,7 +180,8 @@ def align_envelopes(
     flat, shape = flat.detach(), data.shape[:-2]
     size = flat.shape[1] * flat.shape[2] * flat.element_size()
     parts = flat.split(max(1, 8 * block_bytes_of(flat.device) // max(1, size))) if len(flat) else ()
-    parts, courses, jumps = [*parts], [], []
+    parts, jumps = [*parts], []
+    courses: list[Course] = []
     for i, part in enumerate(parts):
         pulses = Envelopes.of(part)
         smooth, std = find(pulses)
@@ -191,7 +192,8 @@ def align_envelopes(
             gain = log_likelihood(pulses, again + jump) - log_likelihood(pulses, smooth)
             better = (gain > math.log(2 * pulses.n) * (jump.diff() != 0).sum(-1))[:, None]
             smooth, jump = torch.where(better, again, smooth), jump * better
-            std, parts[i] = torch.where(better[:, 0], std_again, std), torch.where(better[..., None], without, part)
+            std = std if std_again is None else torch.where(better[:, 0], std_again, std)
+            parts[i] = torch.where(better[..., None], without, part)
         courses.append((smooth, std))
         jumps.append(jump)
     shifts = [course[0] + jump for course, jump in zip(courses, jumps, strict=True)]
