@@ -12,7 +12,7 @@ from PIL import Image
 
 from tests.study.scenes import TILES, bench_of, scene_method, world, write
 from torchsar.core import Draws, Signal
-from torchsar.io import read_points
+from torchsar.io import read_array, read_points
 from torchsar.scene import PointCloud
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.table import load
@@ -205,6 +205,12 @@ BAD = {
     ),
     "no picture": (IMAGE, "words", "cannot be read as an array or a picture"),
     "a dark image": (IMAGE, np.zeros((3, 3)), r"got shape \(3, 3\) with a largest magnitude of 0"),
+    "no extent": (
+        {**IMAGE, "range_extent_m": -1.0},
+        np.ones((2, 2)),
+        "range_extent_m of an image must be a positive number",
+    ),
+    "one number": (CLOUD, "7\n", "has the columns 0, and axes must name"),
     "a line": (IMAGE, np.ones(3), r"must have the shape \(azimuth, range\) .*, got shape \(3,\)"),
     "nan": (IMAGE, np.full((2, 2), np.nan), "with a largest magnitude of nan"),
 }
@@ -220,6 +226,19 @@ def test_a_bad_file_is_one_sentence(case: str, tmp_path: Path, monkeypatch: pyte
     with pytest.raises(ConfigError, match=sentence) as error:
         bench_of(tmp_path, "isal", world=seen("isal", scene))
     assert "\n" not in str(error.value) and "world.scene.target" in str(error.value)
+
+
+@pytest.mark.parametrize("mode, top", [("L", 255), ("I;16", 65535), ("1", 1), ("RGB", 255), ("F", 1.0)])
+def test_pictures_of_all_depths_are_read_upright(mode: str, top: float, tmp_path: Path) -> None:
+    depth = {"I;16": np.uint16, "1": bool, "F": np.float32}.get(mode, np.uint8)
+    image = np.zeros((3, 4), depth)
+    image[2, 1] = top
+    shown = np.stack([image] * 3, -1) if mode == "RGB" else image
+    path = tmp_path / ("picture.tif" if mode == "F" else "picture.png")
+    Image.fromarray(shown).save(path)
+    read = read_array(path)
+    assert read.shape == (3, 4) and read[0, 1] == top and read.sum() == top
+    assert PointCloud.of_image(read, 4.0, 3.0).place_m.tolist() == [[pytest.approx(-4 / 3), -0.375]]
 
 
 def test_a_mesh_without_its_library_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -77,7 +77,7 @@ def read_array(file: str | Path, key: str | None = None) -> np.ndarray:
             with reading(path, "an array or a picture"):
                 picture = stack.enter_context(pillow.open(path))
                 grey = picture if len(picture.getbands()) == 1 and picture.mode != "P" else picture.convert("L")
-                return np.asarray(grey)[::-1].copy()
+                return np.asarray(grey, np.float64)[::-1].copy()
         if held.kind == "table" and key is None:
             return np.stack(list(read_table(path).values()), -1)
         return held.array(key).read()
@@ -120,8 +120,8 @@ def read_points(
     wanted = [name.removesuffix("_m") for name in axes or ("azimuth", "range", *({"height"} & {*columns}))]
     if len(wanted) not in (2, 3) or not all(name in columns for name in wanted):
         raise ValueError(
-            f"{path} has the columns {', '.join(columns)}, and axes must name those of azimuth and range, and of "
-            f"height if wanted, got {', '.join(wanted)}; write for example axes: [{', '.join([*columns][:2])}]"
+            f"{path} has the columns {', '.join(columns) or '(none)'}, and axes must name those of azimuth and range, "
+            f"and of height if wanted, got {', '.join(wanted)}; write for example axes: [{', '.join([*columns][:2])}]"
         )
     used = [columns[name] for name in (*wanted, *({"amplitude"} & {*columns}))]
     if len({len(x) for x in used}) != 1 or not len(used[0]) or not all(np.isfinite(x).all() for x in used):

@@ -18,6 +18,7 @@ from torchsar.scene.trials import (
     finite_numbers,
     refuse_unless,
     refuse_unless_finite,
+    refuse_unless_positive,
     stacked,
     with_dims,
 )
@@ -262,10 +263,14 @@ class PointCloud(Scene):
             The cloud, with points in the middles of pixels.
 
         Raises:
-            ValueError: If the image has another number of dimensions, no pixel above zero, or NaN.
+            ValueError: If an extent is not positive, or the image has another number of dimensions,
+                no pixel above zero, or NaN.
         """
+        for name, extent in (("azimuth", azimuth_extent_m), ("range", range_extent_m)):
+            refuse_unless_positive(f"{name}_extent_m of an image", extent)
         image = torch.as_tensor(amplitude)
-        level = image.abs().to(torch.float64)
+        image = image.to(torch.complex128 if image.is_complex() else torch.float64)
+        level = image.abs()
         bright = level > 10 ** (floor_db / 20) * level.max() if level.numel() else level
         if image.ndim != 2 or not bool(bright.any()):
             raise ValueError(

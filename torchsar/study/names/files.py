@@ -105,7 +105,7 @@ def image_scene(
             amplitudes), or "none".
     """
     image = np.asarray(_read(read_array, file, key))
-    amplitude = np.sqrt(image.clip(0)) if of == "intensity" and not np.iscomplexobj(image) else image
+    amplitude = np.sqrt(image.clip(0), dtype=float) if of == "intensity" and not np.iscomplexobj(image) else image
     keys = {"azimuth_m": azimuth_m, "range_m": range_m, "heading_deg": heading_deg, "fluctuation": fluctuation}
     return PointCloud.of_image(amplitude, azimuth_extent_m, range_extent_m, floor_db, **keys)
 
