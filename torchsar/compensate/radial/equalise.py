@@ -11,7 +11,6 @@ from torchsar.compensate.pulse_phase.data import prepare
 from torchsar.core import (
     Estimate,
     Outcome,
-    Signal,
     Stage,
     checked_samples,
     cis,
@@ -117,26 +116,5 @@ def equalise_pulses(data: Tensor, gain: Tensor) -> Tensor:
     return data / gain[..., None].to(data.real.dtype)
 
 
-class PulseGain(Stage):
-    """Amplitude of every pulse relative to steady scatterers; see `pulse_gain`.
-
-    Provides `gain` of shape (..., pulse), by which `EqualisePulses` divides the pulses.
-
-    Args:
-        assess: False leaves out the outcome.
-    """
-
-    provides = ("gain",)
-    neutral = {"gain": 1.0}
-    differentiable = "where ok"
-
-    def __init__(self, assess: bool = True) -> None:
-        super().__init__()
-        self.assess = assess
-
-    def forward(self, signal: Signal) -> Estimate:
-        """Estimate `gain` of a signal of axes (pulse, range)."""
-        return pulse_gain(signal.data, assess=self.assess)
-
-
+PulseGain = Stage.of(pulse_gain, provides=("gain",), neutral={"gain": 1.0}, differentiable="where ok")
 EqualisePulses = Stage.of(equalise_pulses)
