@@ -1,11 +1,13 @@
 """The table of functions of samples: one row for each, with what is promised of it.
 
 `ENTRIES` holds these rows and those of the stages. A new public function joins by one row here, or
-in `numbers` if it takes numbers only.
+in `numbers` if it takes numbers only. A function of which `Stage.of` makes a stage needs no row but
+that of the stage.
 """
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -156,18 +158,28 @@ def on(kind: str, f: Callable[[Signal], Any]) -> Callable[[Tensor], Any]:
     return lambda data: f(fitted(kind, data))
 
 
-def _stage(case: Case) -> Entry:
-    kind = f"case {case.name}"
+def _rows(case: Case) -> list[Entry]:
+    """The row of a stage, and with it that of the function of which `Stage.of` made the stage."""
+    kind, stage = f"case {case.name}", case.build()
 
-    def call(data: Tensor) -> Any:
+    def given(data: Tensor) -> tuple[Signal, dict[str, Tensor]]:
         signal = fitted(kind, data)
         one = signal.with_data(torch.zeros(1, *(axis.n for axis in signal.axes), dtype=torch.complex128))
-        values = {key: value[0].expand((*signal.trials, *value.shape[1:])) for key, value in case.values(one).items()}
+        return signal, {n: v[0].expand((*signal.trials, *v.shape[1:])) for n, v in case.values(one).items()}
+
+    def call(data: Tensor) -> Any:
+        signal, values = given(data)
         return case.build()(signal, **values)
 
-    return Entry(
-        f"{type(case.build()).__name__}:{case.name}", kind, call, {}, case.zero_ok, laws=case.laws, build=case.build
-    )
+    def call_function(data: Tensor) -> Any:
+        return function(data, **stage.constants, **given(data)[1])
+
+    promised: dict[str, Any] = {"degree": {"data": case.degree}, "zero_ok": case.zero_ok, "laws": case.laws}
+    rows = [Entry(f"{type(stage).__name__}:{case.name}", kind, call, build=case.build, **promised)]
+    function: Any = inspect.unwrap(type(stage).__init__)
+    if function.__name__ == "__init__":
+        return rows
+    return [*rows, Entry(f"{function.__module__.split('.')[1]}.{function.__name__}", kind, call_function, **promised)]
 
 
 def ramp(n: int, scale: float = 0.1) -> Tensor:
@@ -287,9 +299,6 @@ FUNCTIONS = [
         laws=Laws(linear="the spectrum that fills a gap is estimated from the lines"),
     ),
     _entry(
-        "repair.zero_fill", "raw", lambda x: repair.zero_fill(x, missing(x)), laws=Laws(pulse="gaps at fixed lines")
-    ),
-    _entry(
         "repair.linear_fill",
         "raw",
         lambda x: repair.linear_fill(x, missing(x), 0.01),
@@ -341,12 +350,6 @@ FUNCTIONS = [
         laws=Laws(pulse="moves lines to fixed places"),
     ),
     _entry("repair.find_trigger", "record", lambda x: repair.find_trigger(x, LADAR)),
-    _entry(
-        "repair.correct_imbalance",
-        "raw",
-        lambda x: repair.correct_imbalance(x, torch.tensor([1.0, 1.2]), torch.tensor([0.0, 0.5])),
-        laws=Laws(pulse="alternating channels"),
-    ),
     _entry(
         "repair.correct_jitter",
         "raw",
@@ -421,12 +424,6 @@ FUNCTIONS = [
         lambda x: compensate.rotation_autofocus(
             x, 400.0, torch.tensor([1.0, 5.0], dtype=F64).expand(math.prod(x.shape[:-2]), 2), search=4, polish=2
         ),
-    ),
-    _entry(
-        "compensate.correct_pulse_phase",
-        "raw",
-        lambda x: compensate.correct_pulse_phase(x, ramp(x.shape[-2])),
-        laws=Laws(pulse=LINE_NUMBER, energy=1),
     ),
     _entry(
         "compensate.chirplet_clean",
@@ -819,5 +816,5 @@ MORE_STAGES = [
         lambda: multichannel.MigratingLines(BISTATIC, multichannel.Interferometry(BISTATIC, LIT)),
     ),
 ]
-STAGES = [_stage(case) for case in stages.CASES]
+STAGES = [row for case in stages.CASES for row in _rows(case)]
 ENTRIES = STAGES + MORE_STAGES + FUNCTIONS

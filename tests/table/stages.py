@@ -1,6 +1,7 @@
 """The table of stages: one row for each, with what is promised of it, for all families of tests.
 
-A new stage joins by one row here. A function joins by one row in `functions` or `numbers`.
+A new stage joins by one row here, and with it the function, if `Stage.of` made the stage of one.
+Another function joins by one row in `functions` or `numbers`.
 """
 
 from __future__ import annotations
@@ -83,6 +84,8 @@ class Case:
         turning: It works on targets that turn.
         zero_ok: Why a trial of zeros may be ok.
         laws: Which laws hold for it.
+        degree: The power of the level of the samples with which its samples grow; None if they do
+            not follow a power.
     """
 
     name: str
@@ -99,6 +102,7 @@ class Case:
     turning: bool = False
     zero_ok: str = ""
     laws: Laws = ALL_LAWS
+    degree: int | None = 1
 
 
 def _geometry(signal: Signal) -> dict[str, Tensor]:
