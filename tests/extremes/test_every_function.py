@@ -17,7 +17,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.extremes.judge import DTYPES, VIEWS, differences, has_nan, outcome, random_case, trial
+from tests.extremes.judge import DTYPES, VIEWS, differences, nan_in, outcome, random_case, trial
 from tests.table import stages as contract
 from tests.table.functions import ENTRIES, Entry, dims, samples
 from tests.table.numbers import NUMBERS, REASONS
@@ -50,7 +50,10 @@ def test_no_public_function_or_stage_is_missing() -> None:
             stage = inspect.isclass(value) and issubclass(value, Stage)
             if (stage or inspect.isfunction(value)) and not {name if stage else "", f"{package}.{name}"} & listed:
                 missing.append(f"{package}.{name}")
-    assert not missing, f"give each of these an entry, or a reason, in tests/table: {missing}"
+    assert not missing, (
+        f"{missing} need a row each: a stage in tests/table/stages.py (the row of its function too, if Stage.of makes "
+        "it of one), a function of samples in functions.py, one of numbers, or a reason why it has none, in numbers.py"
+    )
 
 
 def test_reasons_stand_for_public_names_without_a_row() -> None:
@@ -71,10 +74,11 @@ def test_levels_and_zeros_in_one_batch(entry: Entry) -> None:
     if isinstance(found, str):
         assert entry.refuses_levels, found
         return
-    assert not any(has_nan(value) for value in found.values())
+    assert entry.nan_ok or not nan_in(found), f"NaN in {nan_in(found)} of trials of finite samples"
     alone = trial(found, 0, 4)
     for i, level in ((1, LEVEL), (2, 1 / LEVEL)):
-        assert not differences(trial(found, i, 4), alone, entry, level)
+        wrong = differences(trial(found, i, 4), alone, entry, level)
+        assert not wrong, f"{wrong}, at {level:.0e} of the level; `degree` of the row says how a result grows with it"
     if "ok" in found and not entry.zero_ok:
         assert not bool(found["ok"][3].any())
 
@@ -90,8 +94,8 @@ def test_views_and_nan(entry: Entry) -> None:
             assert "NaN" in found or "finite" in found or "matched to" in found
             continue
         spoiled = trial(found, 1, 2)
-        assert any(map(has_nan, spoiled.values())) or not bool(spoiled.get("ok", torch.tensor(True)).any())
-        assert not any(map(has_nan, trial(found, 0, 2).values()))
+        assert nan_in(spoiled) or not bool(spoiled.get("ok", torch.tensor(True)).any())
+        assert not nan_in(trial(found, 0, 2)), "a NaN in one trial changes another"
 
 
 @pytest.mark.parametrize("entry", ENTRIES, ids=ids(ENTRIES))
@@ -101,7 +105,7 @@ def test_sizes_and_types(entry: Entry) -> None:
     inputs = [whole[:0], whole[..., :0], *(whole.narrow(dim, 0, 1) for dim in range(-dims(entry.kind), 0))]
     for x in inputs:
         found = outcome(lambda x=x: entry.call(x))
-        assert isinstance(found, str) or not any(has_nan(value) for value in found.values()), tuple(x.shape)
+        assert isinstance(found, str) or not nan_in(found), f"NaN in {nan_in(found)} of samples {tuple(x.shape)}"
     for dtype in DTYPES:
         outcome(lambda dtype=dtype: entry.call(whole.to(dtype) if dtype.is_complex else whole.real.to(dtype)))
 
@@ -185,7 +189,7 @@ def test_extreme_numbers(name: str) -> None:
             found = outcome(lambda k=key, v=value, x=number: call(**{**given, k: extreme(v, x)}))
             if isinstance(found, str) or math.isinf(number):
                 continue
-            shown = any(map(has_nan, found.values()))
+            shown = bool(nan_in(found))
             assert shown == math.isnan(number) or not found or name in MAY_DIFFER, (key, number)
 
 

@@ -67,6 +67,7 @@ class Entry:
         degree: By the name of a result, the power of the level of the samples with which it grows;
             None if it is not a power. By default 1 for samples, 0 for all other results.
         zero_ok: Reason why a trial of zeros may be ok.
+        nan_ok: Reason why a value of a trial may be NaN.
         joint: All trials together give one result.
         refuses_levels: It refuses samples whose power does not fit their precision.
         least: Size of a result below which its rounding errors do not matter.
@@ -79,6 +80,7 @@ class Entry:
     call: Callable[[Tensor], Any]
     degree: dict[str, int | None] = field(default_factory=dict)
     zero_ok: str = ""
+    nan_ok: str = ""
     joint: bool = False
     refuses_levels: bool = False
     least: float = 0.0
@@ -741,6 +743,7 @@ FUNCTIONS = [
         "image",
         on("image", lambda s: metrics.impulse_response(s, (5.0, 4050.0))),
         {"peak": 1},
+        nan_ok="a place without a point has no widths and no side lobes",
     ),
     _entry(
         "metrics.phase_rmse",
