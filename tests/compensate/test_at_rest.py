@@ -11,7 +11,8 @@ from tests.audit import ladars, pulses, strips
 from tests.compensate.scenes import noisy, still, turned, white
 from torchsar.compensate import DopplerCentroid, MirrorProduct, PhaseIncrement, SegmentedInterference, autofocus, sca
 from torchsar.core import Draws, Outcome, Recording, Signal
-from torchsar.echo import GroundAtRest, Leakage, apply_impairments
+from torchsar.echo import Leakage, apply_impairments
+from torchsar.echo.receiver import GroundAtRest
 from torchsar.metrics import phase_rmse
 from torchsar.repair import remove_constant, remove_tones
 

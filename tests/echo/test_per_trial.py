@@ -25,7 +25,6 @@ from torchsar.echo import (
     ChannelErrors,
     ChannelImbalance,
     CorruptedNumbers,
-    GroundAtRest,
     Leakage,
     LostGaps,
     LostLines,
@@ -53,7 +52,7 @@ from torchsar.echo import (
     simulate_turntable,
     smooth_response,
 )
-from torchsar.echo.receiver import GainSteps, GateJumps
+from torchsar.echo.receiver import GainSteps, GateJumps, GroundAtRest
 from torchsar.echo.sea import sea_echo
 from torchsar.radar import InverseRadar, Orbit, seen_point
 from torchsar.scene import (

@@ -11,16 +11,18 @@ import torch
 
 from tests.helpers import kondor_radar, small_radar, small_recording
 from torchsar.core import Chain, Draws, Outcome, Recording, Signal, use
-from torchsar.echo import Quantiser, Tone, WideInterferer, simulate
+from torchsar.echo import PulsedInterference, Quantiser, Tone, WideInterferer, simulate
 from torchsar.focus import OmegaK
 from torchsar.io import read_stripmap
 from torchsar.metrics import error_db
+from torchsar.radar import LinearFM, StripmapRadar
 from torchsar.repair import (
     DropInterference,
     NotchInterference,
     SubtractInterference,
     drop_interference,
     notch_interference,
+    remove_pulses,
     subtract_interference,
 )
 from torchsar.repair.contamination import find_contamination
@@ -331,3 +333,25 @@ def test_outcomes_and_lines_without_assessment(stage, monkeypatch):
     plain_out, plain = stage(assess=False)(signal, missing=before)
     assert plain.outcome.tolist() == [Outcome.NOT_ASSESSED] * 3
     assert torch.equal(plain_out.data, out.data) and torch.equal(plain["missing"], found["missing"])
+
+
+@pytest.mark.parametrize("level_db", [10.0, 30.0])
+@pytest.mark.parametrize("pulse", [{"bandwidth_hz": 20e6}, {"bursts": True}, {"frequency_hz": 3e6}])
+def test_pulses_of_another_radar_are_filled(pulse: dict, level_db: float) -> None:
+    sensor = StripmapRadar(3.2e9, LinearFM(40e6, 2e-6), 50e6, 400.0, 120.0, 4000.0, integration_s=0.8)
+    world = StripmapWorld(RandomPoints(100, 150.0, 400.0), Dwell(0.8), snr_db=10.0)
+    clean, _ = simulate(sensor, world, 512, 256, Draws(1))
+    window_s, length_s = 256 / 50e6, 1e-6  # a fifth of a line, in half of the lines
+    other = PulsedInterference(level_db, 0.49 / (window_s + length_s) + 12.3, length_s, **pulse)
+    hit, truth = other(clean, Draws(2))
+    assert 0.4 < (truth["share"] > 0).double().mean() < 0.6
+
+    def image(data: torch.Tensor) -> torch.Tensor:
+        return OmegaK(sensor, doppler_hz=0.0)(clean.signal.with_data(data)).data
+
+    def alike(data: torch.Tensor) -> float:
+        a, b = image(data), image(clean.signal.data)
+        return float((a.conj() * b).sum().abs() / (a.norm() * b.norm()))
+
+    assert alike(hit.signal.data) < 0.85 and alike(remove_pulses(hit.signal.data)) > 0.98
+    assert alike(remove_pulses(clean.signal.data)) > 0.999

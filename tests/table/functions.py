@@ -365,6 +365,7 @@ FUNCTIONS = [
         laws=Laws(energy=1),
     ),
     _entry("repair.remove_constant", "raw", repair.remove_constant),
+    _entry("repair.remove_pulses", "raw", repair.remove_pulses, laws=Laws(linear="finds the parts that are hit")),
     _entry("repair.remove_tones", "raw", repair.remove_tones, laws=Laws(linear="finds tones")),
     _entry(
         "repair.balance_quadrature",

@@ -312,6 +312,12 @@ CASES = [
     ),
     Case("remove_constant", lambda: repair.RemoveConstant("cell", 2), laws=Laws(pulse="a polynomial of the pulse")),
     Case("remove_constant_of_pulse", lambda: repair.RemoveConstant("pulse")),
+    Case(
+        "remove_pulses",
+        lambda: repair.RemovePulses(),
+        vmap=False,
+        laws=Laws(linear="finds the parts that are hit"),
+    ),
     Case("remove_tones", lambda: repair.RemoveTones(), laws=Laws(linear="finds tones")),
     Case(
         "balance_quadrature",

@@ -17,7 +17,7 @@ interference, converter           `Tone`, `WideInterferer`, `Quantiser`, `Period
 pulses of another radar           `PulsedInterference`
 constant, drift, spur             `Leakage`
 I and Q, gain, range gate         `QuadratureError`, `receiver.GainSteps`, `receiver.GateJumps`
-echo that does not move along     `GroundAtRest`
+echo that does not move along     `receiver.GroundAtRest`
 receiver of one channel           `ChannelResponse`, made by `smooth_response`
 receiver of several channels      `ChannelImbalance` for lines in turn, `ChannelErrors` for channels
                                   along track
@@ -45,7 +45,7 @@ from torchsar.echo.ladar_record import simulate_ladar_record
 from torchsar.echo.lines import CorruptedNumbers, LostGaps, LostLines, LostPulses, RepeatedLines
 from torchsar.echo.path import PathError, path_echo, simulate_path
 from torchsar.echo.pulse_phase import PhaseSinusoid, PhaseWalk, WhitePhase
-from torchsar.echo.receiver import GroundAtRest, Leakage, PulsedInterference, QuadratureError
+from torchsar.echo.receiver import Leakage, PulsedInterference, QuadratureError
 from torchsar.echo.recorded import Impairment, apply_impairments
 from torchsar.echo.response import ChannelResponse, smooth_response
 from torchsar.echo.strip import simulate, stripmap_echo
@@ -57,7 +57,6 @@ __all__ = [
     "ChannelImbalance",
     "ChannelResponse",
     "CorruptedNumbers",
-    "GroundAtRest",
     "Impair",
     "Impairment",
     "Leakage",

@@ -121,7 +121,7 @@ class GroundAtRest:
     >>> from torchsar import Draws, echo, radar, scene
     >>> isar = radar.InverseRadar(1e10, 1e9, 500.0, rotation_rad_s=0.1)
     >>> world = scene.TurntableWorld(scene.Points([0.0], [0.0]))
-    >>> errors = {"phase": echo.WhitePhase(), "ground": echo.GroundAtRest(over_signal_db=0.0)}
+    >>> errors = {"ground": echo.receiver.GroundAtRest(over_signal_db=0.0)}
     >>> _, truth = echo.simulate_turntable(isar, world, 64, 8, Draws(1), errors)
     >>> truth.values["ground.band_cycles"]
     tensor(0.0200, dtype=torch.float64)

@@ -14,6 +14,7 @@ spurs                               `remove_tones`
 unequal I and Q                     `balance_quadrature`, after `remove_constant`
 narrowband interference             `subtract_interference`; `notch_interference`;
                                     `drop_interference` with a fill after it
+pulses of another radar             `remove_pulses`
 sampling jitter, with a pilot tone  `estimate_jitter_pilot`, then `correct_jitter`
 sampling jitter, without a pilot    `estimate_jitter_blind`, then `correct_jitter` (by
                                     `BandLimited`; faster `Lagrange`)
@@ -66,6 +67,7 @@ from torchsar.repair.jitter_blind import BlindJitter, estimate_jitter_blind
 from torchsar.repair.jitter_pilot import PilotJitter, estimate_jitter_pilot
 from torchsar.repair.lines import LineIntegrity, line_integrity
 from torchsar.repair.placing import regular_lines
+from torchsar.repair.pulsed import RemovePulses, remove_pulses
 from torchsar.repair.response import CorrectResponse, correct_response
 from torchsar.repair.response_phase import (
     EstimateFlatResponse,
@@ -105,6 +107,7 @@ __all__ = [
     "NotchInterference",
     "PilotJitter",
     "RemoveConstant",
+    "RemovePulses",
     "RemoveTones",
     "SparseFill",
     "SplitSweeps",
@@ -130,6 +133,7 @@ __all__ = [
     "notch_interference",
     "regular_lines",
     "remove_constant",
+    "remove_pulses",
     "remove_tones",
     "sparse_fill",
     "subtract_interference",

@@ -21,7 +21,7 @@ from torchsar import compensate, echo, focus, metrics, multichannel, repair, sce
 from torchsar.compensate import Autofocus, EffectiveVelocity, RotationAutofocus, UnevenRotation
 from torchsar.compensate.pulse_phase import CorrectPulsePhase
 from torchsar.core import Alternate, Stage, Turn
-from torchsar.echo.receiver import GainSteps, GateJumps
+from torchsar.echo.receiver import GainSteps, GateJumps, GroundAtRest
 from torchsar.focus import OmegaK, PaddedLines, TargetImage
 from torchsar.metrics import Measure
 from torchsar.multichannel import (
@@ -413,7 +413,7 @@ _OF_TARGETS = (
     echo.PhaseSinusoid,
     echo.Quantiser,
     GateJumps,
-    echo.GroundAtRest,
+    GroundAtRest,
     *_OF_RECEIVERS,
 )
 IMPAIRMENTS = Catalogue(
