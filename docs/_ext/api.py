@@ -192,11 +192,13 @@ class Derivatives(SphinxDirective):
             face, name = split(qualified)
             kind = getattr(getattr(face, name), "differentiable", "yes")
             if kind in named:
-                named[kind].append(f"`~{qualified}`")
-        lines = [".. list-table::", "   :header-rows: 1", "", "   * - Derivatives", "     - Stages and functions"]
-        for kind, found in named.items():
-            lines += [f"   * - {kind}", f"     - {', '.join(found)}"]
-        lines += ["   * - yes", "     - all others that work on samples or numbers"]
+                named[kind].append(f"{{py:obj}}`~{qualified}`")
+        rows = [*((kind, ", ".join(found)) for kind, found in named.items()), ("yes", "all others")]
+        lines = [
+            "| derivatives | stages and functions |",
+            "|---|---|",
+            *(f"| {kind} | {found} |" for kind, found in rows),
+        ]
         return self.parse_text_to_nodes("\n".join(lines))
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from torchsar.core import Axis, Signal, Stage, checked_samples, host_value, level_of, power_of
+from torchsar.core import Axis, Signal, Stage, checked_samples, host_value, level_of, power_of, unit_level
 from torchsar.core.derivatives import is_differentiated
 
 
@@ -129,6 +129,7 @@ def to_db(power_: Tensor, floor_db: float = -120.0, reference: Tensor | None = N
     if not isinstance(power_, Tensor) or not power_.is_floating_point() or power_.ndim < 2 or not power_.numel():
         got = f"{power_.dtype} of shape {tuple(power_.shape)}" if isinstance(power_, Tensor) else type(power_).__name__
         raise ValueError(f"to_db converts real power (..., azimuth, range) with at least one sample, got {got}")
+    power_ = unit_level(power_) if reference is None else power_  # derivatives do not overflow
     top = power_.amax((-2, -1)) if reference is None else reference
     top = top[..., None, None]
     ratio = power_ / torch.where(top > 0, top, 1)
