@@ -1,7 +1,4 @@
-"""The systems by name, and the reading of config files.
-
-This is the only module that names the systems.
-"""
+"""The systems by name, and the reading of config files."""
 
 from __future__ import annotations
 
@@ -10,6 +7,7 @@ from contextlib import nullcontext
 from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
+from pkgutil import iter_modules
 from typing import Any
 
 from torchsar.study.settings.errors import ConfigError, did_you_mean, loading
@@ -17,10 +15,10 @@ from torchsar.study.settings.sections import Loaded, Sweep, checked
 from torchsar.study.settings.text import find_config, override, read_tree
 from torchsar.study.trials.system import System
 
-# Modules with the class `SYSTEM` of each system, by name. Other packages add systems by the entry
-# point group `torchsar.systems` (name = "package.module").
-_NAMES = ("stripmap", "isal", "isal_rotation", "sal", "geo", "geo_ocean", "path")
-SYSTEMS = {name: f"torchsar.study.systems.{name}" for name in _NAMES}
+# Modules with the class `SYSTEM` of each system, by name: all of `systems`. Other packages add
+# systems by the entry point group `torchsar.systems` (name = "package.module").
+_PACKAGE = "torchsar.study.systems"
+SYSTEMS = {one.name: f"{_PACKAGE}.{one.name}" for one in iter_modules(import_module(_PACKAGE).__path__)}
 
 
 class _Systems(Mapping[str, System]):
@@ -88,7 +86,6 @@ def _system_of(tree: Any, file: str) -> System:
     name = tree.get("system", "stripmap")
     if not isinstance(name, str) or name not in systems:
         raise ConfigError(
-            f"{file}: key 'system' has the value {name!r}; it should be one of "
-            f"{', '.join(systems)}{did_you_mean(str(name), systems)}"
+            f"{file}: key 'system' has the value {name!r}, which is no system{did_you_mean(str(name), systems)}"
         )
     return systems[name]

@@ -29,7 +29,7 @@ def listing(systems: Mapping[str, System]) -> str:
         for section, keys in system.sections.items():
             lines += [f"    {section}", *_keys(keys)]
         own = [stage for stage in system.stages.entries if stage not in stages().entries]
-        lines += ["    stages of its own", *_entries(system.stages, own)] if own else []
+        lines += ["    stages of its own", *(f"    {line}" for line in _entries(system.stages, own))] if own else []
     for group in (*GROUPS, "own"):
         names = [name for name in stages().entries if group_of(name) == group]
         lines += ["", f"STAGES, {group} (processor.METHOD.stages)", *_entries(stages(), names)] if names else []

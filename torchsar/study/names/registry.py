@@ -510,7 +510,7 @@ GROUPS: dict[str, dict[str, Callable[..., Any]]] = {
 }
 GROUPS["metrics"] = {}
 for _group, _made in _BUILT.items():
-    GROUPS[_group] |= {one.__name__: one for one in _made}
+    GROUPS[_group] = dict(sorted((GROUPS[_group] | {one.__name__: one for one in _made}).items()))
 
 
 @cache
