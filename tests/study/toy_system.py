@@ -1,8 +1,9 @@
 """A whole system in one file: a tone in noise whose frequency is estimated.
 
 It is a model for systems of your own. A package makes it known by an entry point of the group
-`torchsar.systems`, `tone = "tests.study.toy_system"`; `run`, `sweep`, `trade`, `requires` and
-`list` then work on configs with `system: tone`, and nothing else has to change.
+`torchsar.systems`, `tone = "tests.study.toy_system"`, and this repository by its place in
+`torchsar/study/systems`. Then `run`, `sweep`, `trade`, `requires` and `list` work on configs with
+`system: tone`, such as `CONFIG` of `test_toy_system.py`, and nothing else has to change.
 """
 
 from __future__ import annotations
