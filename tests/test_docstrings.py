@@ -92,7 +92,7 @@ def test_examples_run(path: Path) -> None:
     parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
     module = importlib.import_module(".".join(parts if parts[-1] != "__init__" else parts[:-1]))
     found = doctest.testmod(module)
-    assert found.attempted and not found.failed
+    assert found.attempted and not found.failed, "what the example printed stands above, under `Got`"
 
 
 FACES = ("core", "radar", "scene", "echo", "repair", "compensate", "multichannel", "focus", "metrics", "optim", "io")
@@ -107,7 +107,8 @@ def test_every_public_name_has_an_example() -> None:
             if inspect.isclass(value) or inspect.isfunction(value):
                 idea = f"{face.__name__}.{name.replace('_', '').lower()}"
                 found[idea] = found.get(idea, False) or ">>>" in (inspect.getdoc(value) or "")
-    assert not [idea for idea, shown in found.items() if not shown]
+    bare = [idea for idea, shown in found.items() if not shown]
+    assert not bare, f"{bare} need an example (>>>) in the docstring of the function, or in that of the stage"
 
 
 def constant(node: ast.stmt) -> ast.expr | None:

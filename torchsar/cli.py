@@ -49,7 +49,9 @@ def parser() -> argparse.ArgumentParser:
     Returns:
         Parser of all commands and their options.
     """
-    top = argparse.ArgumentParser(prog="torchsar", description="Synthetic aperture radar experiments from a config.")
+    top = argparse.ArgumentParser(
+        prog="torchsar", description="Simulate and process data of synthetic aperture radar and ladar."
+    )
     top.add_argument("--version", action="store_true", help="print the version and end")
     top.add_argument(
         "--threads",

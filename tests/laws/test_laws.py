@@ -89,10 +89,11 @@ def test_linear(entry: Entry, seed: int, angle: float, level: float) -> None:
     of_x, of_y, of_both = (called(entry, z)["data"] for z in (x, y, a * x + y))
     # differences relative to the larger of the terms, which may cancel
     largest = max(abs(a) * float(of_x.abs().max()), float(of_y.abs().max()), 1e-300)
-    assert float((of_both - a * of_x - of_y).abs().max()) <= 1e-9 * largest
+    gone = float((of_both - a * of_x - of_y).abs().max())
+    assert gone <= 1e-9 * largest, "not linear: give the reason in `linear` of the laws of the row, or its `degree`"
     if entry.laws.energy:
         grown = float(of_x.abs().square().sum() / x.abs().square().sum())
-        assert grown == pytest.approx(entry.laws.energy, rel=1e-9)
+        assert grown == pytest.approx(entry.laws.energy, rel=1e-9), "not the `energy` of the laws of the row"
 
 
 SHIFTED = [(entry, axis) for axis in ("pulse", "range") for entry in LINEAR if axis in axes(entry)]
