@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
@@ -160,3 +161,10 @@ def test_own_stage_joins_through_the_entry_point(tmp_path: Path) -> None:
     assert made == "3.0 own", done.stderr[-1500:]
     # a stage without a docstring is not described by that of its base class
     assert [line.split(maxsplit=1) for line in listed] == [["louder", "Everything times a gain."], ["silent"]]
+
+
+def test_a_system_of_another_package_does_not_replace_a_built_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    point = EntryPoint("stripmap", "other.package", "torchsar.systems")
+    monkeypatch.setattr("torchsar.study.table.entry_points", lambda group: [point])
+    with pytest.raises(ConfigError, match=r"torchsar\.systems:stripmap \(other\.package\) has the name of a built-in"):
+        list(table.systems)

@@ -389,3 +389,11 @@ def test_a_report_that_fails_leaves_the_results(
         assert main(arguments) in (2, 130)
     assert said in capsys.readouterr().err and read_sweep(tmp_path / "s").done.all()
     assert main(arguments) == 0 and (tmp_path / "s" / "report.html").exists()
+
+
+def test_a_trial_that_ends_the_program_is_named() -> None:
+    def leaves(parameters: Any, draws: Draws) -> Any:
+        raise SystemExit(0)
+
+    with pytest.raises(ConfigError, match=r"trials 0 to \d+ of .* failed: SystemExit: 0"):
+        run(function=leaves)

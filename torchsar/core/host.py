@@ -115,7 +115,7 @@ def device_fault(device: torch.device | str) -> str:
     return ""
 
 
-def is_out_of_memory(error: Exception) -> bool:
+def is_out_of_memory(error: BaseException) -> bool:
     """Decide whether an error says that memory is short.
 
     Args:

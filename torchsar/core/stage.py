@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from torchsar.core.derivatives import Differentiable, without_derivatives
 from torchsar.core.estimate import Estimate
-from torchsar.core.host import checked_samples, gathered_checks, refuse_non_finite_values
+from torchsar.core.host import check_value, checked_samples, gathered_checks, refuse_non_finite_values
 from torchsar.core.show import argument
 from torchsar.core.signal import Signal
 
@@ -174,10 +174,30 @@ class Stage(nn.Module):
         with without_derivatives(name, given) if constant else nullcontext(given) as (args, values):
             result = super().__call__(*args, **values)
         if isinstance(result, Estimate):
-            return self._with_neutral(result, values)
+            return self._with_neutral(self._checked(result, signal.trials), values)
         if isinstance(result, tuple) and isinstance(result[-1], Estimate):
-            return (*result[:-1], self._with_neutral(result[-1], values))
+            return (*result[:-1], self._with_neutral(self._checked(result[-1], signal.trials), values))
         return result
+
+    def _checked(self, estimate: Estimate, trials: torch.Size) -> Estimate:
+        """Return an estimate after a check of its names, its trials and its quality."""
+        name, shape, n = type(self).__name__, estimate.outcome.shape, len(trials)
+        missing = set(self.provides) - set(estimate.value)
+        if missing:
+            raise ValueError(f"{name} provides {self.provides}, but its Estimate has only {list(estimate.value)}")
+        if trials not in [shape[first : first + n] for first in range(len(shape) - n + 1)]:
+            raise ValueError(
+                f"{name} estimates for the trials {tuple(trials)} of the signal, but the outcome of its Estimate has "
+                f"the shape {tuple(shape)}; reduce over the dimensions of the samples only"
+            )
+
+        def refuse(least: float, largest: float) -> None:
+            if least < 0 or largest > 1:
+                raise ValueError(f"{name}: the quality of an Estimate lies from 0 to 1, got {least:g} to {largest:g}")
+
+        if estimate.quality.numel():
+            check_value(torch.stack([estimate.quality.min(), estimate.quality.max()]), refuse)
+        return estimate
 
     def _with_neutral(self, estimate: Estimate, given: Mapping[str, Any]) -> Estimate:
         """Add the neutral values of the stage to an estimate, one for each value that has one."""
@@ -213,11 +233,15 @@ def _explained(init: Callable[..., None]) -> Callable[..., None]:
         try:
             init(self, *args, **kwargs)
         except (TypeError, AttributeError) as error:
+            if "_modules" not in vars(self):
+                raise TypeError(f"{type(self).__name__}.__init__ must call super().__init__() first") from error
             # no note from a base class, which is called with other arguments
             if type(self).__init__ is explained:
                 given = textwrap.shorten(f"{args} and {kwargs}", 200)
                 error.add_note(f"{type(self).__name__}{inspect.signature(type(self))} was given {given}")
             raise
+        if "_modules" not in vars(self):
+            raise TypeError(f"{type(self).__name__}.__init__ must call super().__init__() first")
         if type(self).__init__ is explained:
             names = list(inspect.signature(type(self)).parameters)
             given = {**dict(zip(names, args)), **kwargs}

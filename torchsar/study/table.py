@@ -28,7 +28,13 @@ class _Systems(Mapping[str, System]):
         self._made: dict[str, System] = {}
 
     def _modules(self) -> dict[str, Any]:
-        return {**SYSTEMS, **{point.name: point for point in entry_points(group="torchsar.systems")}}
+        added = {point.name: point for point in entry_points(group="torchsar.systems")}
+        for name in added.keys() & SYSTEMS.keys():
+            raise ConfigError(
+                f"the entry point torchsar.systems:{name} ({added[name].value}) has the name of a built-in system; "
+                "rename it, or uninstall its package"
+            )
+        return {**SYSTEMS, **added}
 
     def __getitem__(self, name: str) -> System:
         if name not in self._made:

@@ -218,12 +218,12 @@ class Work:
                     continue
                 try:
                     parts.append(self._once(piece))
-                except Exception as error:
+                except (Exception, SystemExit) as error:
                     self._refuse_unless_halving_helps(piece, error)
                     found, waiting = -(-len(piece) // 2), [piece, *waiting]
         return Computed(parts, found if found != fits else None, tuple(dict.fromkeys(said)))
 
-    def _refuse_unless_halving_helps(self, chunk: Chunk, error: Exception) -> None:
+    def _refuse_unless_halving_helps(self, chunk: Chunk, error: BaseException) -> None:
         """Raise a ConfigError, unless the error is that a batch of several trials did not fit into
         memory.
         """

@@ -232,6 +232,8 @@ class Bench:
                 raise (ValueError if trace.signal.names in system.images else ConfigError)(f"processor.{name}, {fault}")
             with gathered_checks():
                 judged = self.system.judge(self, name, replace(trace, estimates=estimates), trials, detail)
+        except SystemExit as error:
+            raise ConfigError(f"{self.file}: processor.{name}: a stage ends the program") from error
         except ConfigError as error:
             raise ConfigError(str(error) if str(error).startswith(self.file) else f"{self.file}: {error}") from error
         except Exception as error:  # a stage of the user may raise any error

@@ -1,0 +1,60 @@
+"""Stages of users: what they forget is one sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+
+from torchsar.core import Axis, Chain, Estimate, Signal, Stage
+
+AXES = Axis("pulse", 4, 0.0, 0.1, "s"), Axis("range", 3, 0.0, 1.0, "m")
+SIGNAL = Signal(torch.ones(2, 4, 3, dtype=torch.complex64), AXES)
+
+
+class Estimates(Stage):
+    """Returns the estimate that a test makes."""
+
+    provides = ("level",)
+
+    def __init__(self, make: Callable[[], Estimate]) -> None:
+        super().__init__()
+        self.make = make
+
+    def forward(self, signal: Signal) -> Estimate:
+        return self.make()
+
+
+@pytest.mark.parametrize("attribute", [2.0, torch.nn.Identity()], ids=["number", "module"])
+def test_a_constructor_begins_with_that_of_the_base(attribute: object) -> None:
+    class Forgets(Stage):
+        def __init__(self) -> None:
+            self.attribute = attribute
+
+    with pytest.raises(TypeError, match=r"Forgets\.__init__ must call super\(\)\.__init__\(\) first"):
+        Forgets()
+
+
+@pytest.mark.parametrize(
+    "make, said",
+    [
+        (lambda: Estimate({"level": torch.tensor(1.0)}), r"for the trials \(2,\) .* has the shape \(\)"),
+        (lambda: Estimate({"level": torch.ones(3)}), r"for the trials \(2,\) .* has the shape \(3,\)"),
+        (lambda: Estimate({"other": torch.ones(2)}), r"provides \('level',\), .* only \['other'\]"),
+        (
+            lambda: Estimate({"level": torch.ones(2)}, quality=torch.tensor([0.5, 7.0])),
+            "lies from 0 to 1, got 0.5 to 7",
+        ),
+    ],
+    ids=["no trial", "other trials", "other name", "quality"],
+)
+def test_an_estimate_fits_its_stage_and_the_trials(make: Callable[[], Estimate], said: str) -> None:
+    with pytest.raises(ValueError, match=f"Estimates.*{said}"):
+        Chain(level=Estimates(make))(SIGNAL)
+
+
+def test_estimates_of_targets_and_of_further_trials_are_accepted() -> None:
+    for shape in ((2,), (2, 5), (3, 2)):
+        found = Estimates(lambda shape=shape: Estimate({"level": torch.ones(shape)}))(SIGNAL)
+        assert found["level"].shape == shape
