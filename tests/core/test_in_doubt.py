@@ -168,7 +168,7 @@ def test_vmap_agrees_with_the_batch() -> None:
     class Large(Level):
         def forward(self, signal: Signal, level: Tensor | None = None) -> Estimate:
             large = signal.data.real.amax((-2, -1))
-            return replace(super().forward(signal), outcome=Outcome.of(large > 10, Outcome.NOISE), quality=large)
+            return replace(super().forward(signal), outcome=Outcome.of(large > 10, Outcome.NOISE), quality=large / 32)
 
     x, chain = pulses(), Chain(level=Large(), correct=use(Subtract(), level="level"))
     mapped = torch.vmap(lambda data: chain(x.with_data(data)).data)(x.data)

@@ -392,7 +392,7 @@ def test_a_report_that_fails_leaves_the_results(
 
 
 def test_a_trial_that_ends_the_program_is_named() -> None:
-    def leaves(parameters: Any, draws: Draws) -> Any:
+    def leaves(parameters: Any, draws: Any) -> Any:
         raise SystemExit(0)
 
     with pytest.raises(ConfigError, match=r"trials 0 to \d+ of .* failed: SystemExit: 0"):
