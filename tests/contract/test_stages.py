@@ -126,7 +126,7 @@ def test_state_moves_and_input_is_left_alone(case: Case) -> None:
 
 @pytest.mark.parametrize("case", CASES, ids=IDS)
 def test_forward_mode_equals_reverse_mode(case: Case) -> None:
-    stage, signal = case.build(), entering(case, raw(2, n_pulse=10, n_range=32))
+    stage, signal = case.build(), entering(case, raw(2, n_pulse=18, n_range=32))
     if stage.differentiable == "no":
         return
     values = case.values(signal)
