@@ -293,10 +293,11 @@ class Fit:
 
 
 def solve(matrix: Tensor, start: Tensor, position: Tensor | None = None, rounds: int = 25) -> Fit:
-    """Minimise the mean over blocks of half of w^H Q w - 2 sum(a), by damped Newton steps.
+    """Minimise the mean over blocks of w^H Q w / 2 - sum(a) by damped Newton steps.
 
-    The weights w are exp(a + j p), in block b exp(a + j (p + position[b] d)). The common phase and
-    the common turn are kept.
+    In block b the weights are w = exp(a + j (p + position[b] d)), with log amplitudes a, phases p,
+    and turns d, the change of phase from the middle of the range band to its end. The phase and the
+    turn that all channels have in common keep their first values.
 
     Args:
         matrix: Hermitian matrices Q, complex128 (..., block, channel, channel).

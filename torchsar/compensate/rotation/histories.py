@@ -150,7 +150,8 @@ def refined_by_histories(
             of the start causes.
 
     Returns:
-        The refined rotation; that to start from where there is no scatterer.
+        The refined rotation; `motion` itself in trials without a scatterer, or where the refined
+        rotation is not possible (`Motion.possible`).
     """
     found = histories_of(data, sampling, motion, free_centre=free_centre, half_cells=half_cells)
     moved = motion.moved(found.change)

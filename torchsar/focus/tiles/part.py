@@ -69,7 +69,11 @@ class Band:
         return cls(n, float(waves[n // 2]), float(waves[-1]), length, speed_m_s / (length * step_hz))
 
     def profiles(self, history: Tensor) -> Tensor:
-        """Range profiles (..., length) of a history (..., frequency), from difference zero on."""
+        """Range profiles (..., length) of a phase history (..., frequency).
+
+        Sample k is at the path difference k step_m. Negative differences are at the end, since the
+        profile is periodic.
+        """
         low, high = history[..., : self.n // 2], history[..., self.n // 2 :]
         padded = torch.cat([high, history.new_zeros(*history.shape[:-1], self.length - self.n), low], -1)
         return torch.fft.ifft(padded, dim=-1, norm="forward")
@@ -179,8 +183,8 @@ class Part:
     @property
     def table_count(self) -> int:
         """Largest number of complex values in the tables of all tiles for one path."""
-        # positions in the window are integers, and weights at nodes are real, so that two of them
-        # take the memory of one complex number
+        # weights at nodes and at points of the tile are real, so that two of them count as one
+        # complex number; the position of a window, an int64, counts as one
         real = self.nodes + (0 if self.shares is None else math.prod(self.choice.points))
         return len(self.centre) * self.count * (self.samples + self.length + real // 2 + 1)
 

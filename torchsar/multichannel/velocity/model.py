@@ -245,7 +245,7 @@ def _of_unit_diagonal(normal: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def refuse_unknowns(unknowns: tuple[str, ...]) -> None:
-    """Raise ValueError unless the names are among `u_r_m_s`, `u_a_m_s` and `y0_m`, each once.
+    """Raise ValueError unless there are names, among `u_r_m_s`, `u_a_m_s` and `y0_m`, each once.
 
     Args:
         unknowns: Names of the parameters to estimate.

@@ -207,7 +207,7 @@ class Loaded:
     Args:
         config: The sections; `radar`, `world`, `metrics` and stages are mappings with all keys.
         system: Its system, with the keys of these sections and of the stages.
-        file: Name of the file with the overrides, for messages.
+        file: Name of the config file, with the overrides of the call behind it, for messages.
         name: Name of the file without its suffix.
     """
 

@@ -259,8 +259,8 @@ def _sweeps_axis(trace: Trace) -> Axis:
 
 
 def _compensated(chain: Chain, trace: Trace) -> Tensor | None:
-    """Velocity (..., pulse) that was removed, or that would be removed in a chain without
-    an image.
+    """Velocity (..., pulse) that the stages of a chain removed. If none uses a velocity, it is the
+    last estimate, provided that the chain ends with separated sweeps; otherwise it is None.
     """
     used = {key for uses in chain.uses.values() for key in uses}
     return _summed(chain, trace, "velocity_m_s") if "velocity_m_s" in used or trace.signal.names == SWEEPS else None
