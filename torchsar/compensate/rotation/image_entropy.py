@@ -511,7 +511,7 @@ class ImageEntropy:
             yield from (slice(i, min(i + height, begin + whole)) for i in range(begin, begin + whole, height))
 
     def _cost(self, part: slice, x: Tensor, count: int) -> Tensor:
-        """Entropies (row,) of the images for a block of vectors of unknowns (row, n), of which there
+        """Entropies (row,) of the images for a block of unknowns (row, n), of which there
         are `count` for each trial; infinite where a rotation is not feasible.
         """
         own = slice(part.start // count, (part.stop - 1) // count + 1)
