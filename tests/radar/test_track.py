@@ -72,6 +72,7 @@ MISTAKES = {
     "times": ("time,x,y,z", [TIME[::-1], *PLACE.T], "times rise, got 8, and 1.5 s after 1.75 s; sort them"),
     "scaled latitude": ("t,lat,lon,alt", [TIME, 48e7 + TIME, 11e7 + TIME, TIME], "whether they are scaled by 1e7"),
     "text": ("t,x,y,z\n1,2,3,4\n1,2,three,4", [TIME, *PLACE.T], "row 3 is no row of numbers: '1,2,three,4'"),
+    "a name twice": ("t,x,y,x", [TIME, *PLACE.T], "several columns have the name 'x'; give each a name of its own"),
     "a short row": ("t,x,y,z\n1,2,3", [TIME, *PLACE.T], "row 3 has 4 numbers, and others have 3"),
 }
 

@@ -168,6 +168,9 @@ def read_table(path: Path) -> dict[str, np.ndarray]:
         rows.append(values)
     if not rows:
         raise ValueError(f"{path} holds no rows of numbers")
+    twice = {name for name in names if names.count(name) > 1}
+    if twice:
+        raise ValueError(f"{path}: several columns have the name {min(twice)!r}; give each a name of its own")
     table = np.array(rows)
     return dict(zip(names, table.T)) if len(names) == table.shape[1] else _numbered(table)
 
