@@ -58,3 +58,8 @@ def test_estimates_of_targets_and_of_further_trials_are_accepted() -> None:
     for shape in ((2,), (2, 5), (3, 2)):
         found = Estimates(lambda shape=shape: Estimate({"level": torch.ones(shape)}))(SIGNAL)
         assert found["level"].shape == shape
+
+
+def test_a_wrong_argument_is_what_the_error_says() -> None:
+    with pytest.raises(TypeError, match="unexpected keyword argument 'gain'"):
+        Estimates(gain=2.0)  # pyright: ignore[reportCallIssue]

@@ -233,7 +233,7 @@ def _explained(init: Callable[..., None]) -> Callable[..., None]:
         try:
             init(self, *args, **kwargs)
         except (TypeError, AttributeError) as error:
-            if "_modules" not in vars(self):
+            if "before Module.__init__() call" in str(error):  # in the words of torch
                 raise TypeError(f"{type(self).__name__}.__init__ must call super().__init__() first") from error
             # no note from a base class, which is called with other arguments
             if type(self).__init__ is explained:
