@@ -182,8 +182,7 @@ class Stage(nn.Module):
     def _checked(self, estimate: Estimate, trials: torch.Size) -> Estimate:
         """Return an estimate after a check of its names, its trials and its quality."""
         name, shape, n = type(self).__name__, estimate.outcome.shape, len(trials)
-        missing = set(self.provides) - set(estimate.value)
-        if missing:
+        if self.provides and not set(self.provides) & set(estimate.value):
             raise ValueError(f"{name} provides {self.provides}, but its Estimate has only {list(estimate.value)}")
         if trials not in [shape[first : first + n] for first in range(len(shape) - n + 1)]:
             raise ValueError(
