@@ -42,6 +42,7 @@ def test_every_part_of_a_config_is_measured(result: Path) -> None:
     assert next(row for row in rows if row["part"] == "memory")["peak_bytes"] > 1e8
 
 
+@pytest.mark.slow
 def test_what_became_slower_is_listed(result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     compare = script("compare_benchmarks").main
     assert compare([str(result), str(result)]) == 0
@@ -57,6 +58,7 @@ def test_what_became_slower_is_listed(result: Path, tmp_path: Path, capsys: pyte
     assert compare([str(changed), str(result), "--limit", "1.6"]) == 0
 
 
+@pytest.mark.slow
 @compiles_stages
 def test_the_gain_of_compiled_chains_is_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """By a compiler that takes a moment; what cannot be compiled is named."""

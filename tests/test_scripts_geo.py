@@ -9,6 +9,7 @@ import pytest
 from tests.scripting import rows, run, script
 
 
+@pytest.mark.slow
 def test_orbit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     table = rows(run("geo_orbit", tmp_path, {"coefficients"}, capsys), 34)
     assert table["largest, squint 90 deg"][0] == pytest.approx(376, abs=2)

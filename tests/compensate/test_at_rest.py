@@ -29,6 +29,7 @@ def scene() -> tuple[Signal, torch.Tensor]:
     return pulses.signal(turned(noisy(still(TRIALS, pulses.PULSES, 48, 1, 0.8, 3), 20.0, 5), phase)), phase
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level_db", [3.0, 10.0, 30.0])
 @pytest.mark.parametrize(
     ("effect", "remove"),
@@ -51,6 +52,7 @@ def test_phases_of_pulses(effect: Callable, remove: Callable, level_db: float) -
     assert again.ok.all() and phase_rmse(again["phase_rad"], phase).max() < 0.15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level_db", [-20.0, 0.0, 30.0])
 @pytest.mark.parametrize(("spur", "remove"), [((0.0, 0.0), remove_constant), ((0.15, 0.21), remove_tones)])
 def test_doppler(spur: tuple[float, float], remove: Callable, level_db: float) -> None:

@@ -175,6 +175,7 @@ def test_centroid_of_points_cut_by_the_ends_of_the_strip(squint: float, ambiguit
     assert (estimate["squint_deg"] - exact).abs().max() < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("off", [-58.0, 58.0])
 def test_velocity_within_a_third_of_a_metre_per_second(off: float) -> None:
     radar = kondor(0.8)

@@ -233,6 +233,7 @@ def test_lost_pulses_are_bridged() -> None:
     assert float(rms(off(found["shift_cells"], true)).max()) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS.values(), ids=list(METHODS))
 def test_empty_data_give_finite_values(method) -> None:
     x = aircraft(10.0, 2, 40)[0]

@@ -46,6 +46,7 @@ def test_missing_pulses_do_not_make_phases_wrong(missing: str, pulses: tuple[Ten
     assert not (found.ok & ((error > 5 * std) | (error > 0.5))).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("points", [3, 10])
 def test_a_gap_of_two_fifths_is_doubtful(points: int) -> None:
     """10 of 24 trials of three points were ok and wrong, and 19 of ten."""

@@ -165,6 +165,7 @@ def test_a_wrong_minimum_that_all_starts_have_in_common_is_not_ok() -> None:
     assert right or not bool(found.ok)
 
 
+@pytest.mark.slow
 def test_noise_and_too_few_pulses_are_not_ok() -> None:
     recording = recorded(1)
     frequency, some = recording.aux["frequency_hz"], slice(0, 24)

@@ -31,6 +31,7 @@ def observed(snr_db: float, doppler_hz: float, trials: int = 60, seed: int = 1):
     return PointDoppler(RADAR)(OmegaK(RADAR)(recording.signal)), q
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("snr_db, doppler_hz", [(-20.0, 391.0), (-10.0, 652.0), (0.0, 913.0)])
 def test_error_reaches_the_bound_of_a_tone_below_the_papers_curve(snr_db: float, doppler_hz: float) -> None:
     found, q = observed(snr_db, doppler_hz)
@@ -100,6 +101,7 @@ def test_a_frame_is_required() -> None:
         PointDoppler(radar)(Signal(torch.ones(64, 64, dtype=torch.complex64), radar.image_axes(radar.raw_axes(64, 64))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at_m, inside", [(40.0, True), (140.0, True), (-145.0, True), (165.0, False)])
 def test_the_std_of_a_cut_aperture_follows_its_observed_part(at_m: float, inside: bool) -> None:
     """An airborne radar with 307 m of track and 120 m of aperture.

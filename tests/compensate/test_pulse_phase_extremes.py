@@ -25,6 +25,7 @@ def scene(trials: int = 2, snr_db: float = 10.0, **kwargs) -> tuple[Tensor, Tens
 # scale
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "dtype, scale",
     [
@@ -182,6 +183,7 @@ LOST = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", LOST)
 @pytest.mark.parametrize("name", ["pga_sca", "entropy_fixed_point", "autofocus"])
 def test_lost_pulses_are_bridged(name, where):
@@ -219,6 +221,7 @@ def test_lost_pulses_may_differ_between_trials():
 # noise alone
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [(128, 16), (64, 48), (96, 2), (96, 3), (128, 5), (16, 16), (6, 64), (32, 100)])
 @pytest.mark.parametrize("name", NAMES)
 def test_noise_is_not_ok(name, shape):
@@ -240,6 +243,7 @@ def test_oversampled_noise_is_not_ok(name, oversampling):
     assert not METHODS[name](x).ok.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind",
     [

@@ -121,6 +121,7 @@ STAGES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case, place", STAGES)
 def test_stages(case: Case, place: Place) -> None:
     """Two trials, and the same two twice."""
@@ -141,6 +142,7 @@ def test_stages(case: Case, place: Place) -> None:
 HERE = [case for case in CASES if case.name not in ELSEWHERE]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", HERE, ids=[case.name for case in HERE])
 def test_nan_becomes_no_index(case: Case) -> None:
     """On a device a stage meets the NaN that its checks, which are read late, will refuse."""

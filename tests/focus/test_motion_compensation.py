@@ -94,6 +94,7 @@ STRIPS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STRIPS)
 def test_the_loss_is_predicted_within_a_factor_of_one_and_a_half(name: str) -> None:
     strip = STRIPS[name]

@@ -245,6 +245,7 @@ def test_invalid_arguments_raise():
         backproject_spotlight(x, geometry, X[:0], Y[:0])
 
 
+@pytest.mark.slow
 def test_recorded_car_park(recorded):
     recording = read_inverse(recorded("gotcha_pass1_hh_az001_003.npz"))
     stage = SpotlightBackprojection(100.0, 0.25)

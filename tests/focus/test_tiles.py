@@ -155,6 +155,7 @@ def small(drawn: Case) -> Case:
     )
 
 
+@pytest.mark.slow
 def test_gradcheck_in_history_and_positions() -> None:
     drawn = case(1008)
     few = replace(small(drawn), grid=replace(drawn.grid, counts=(4, 3)))
@@ -239,6 +240,7 @@ def hilly(drawn: Case, slope: float) -> Case:
     return replace(drawn, grid=replace(grid, height_m=height))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(1000, 1008))
 def test_the_promised_error_holds_on_hills(seed: int) -> None:
     drawn = hilly(case(seed), 0.02)
@@ -309,6 +311,7 @@ def strip(pulses: int = 400, pixels: int = 400) -> tuple[Case, Callable[[Tensor]
     return drawn, lit
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("weighted", [False, True])
 def test_a_strip_sums_the_pulses_that_light_each_pixel(weighted: bool) -> None:
     drawn, lit = strip(pixels=390)

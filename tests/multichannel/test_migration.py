@@ -49,6 +49,7 @@ def corrected(signal, reference, migration, ambiguity=0.0):
     return signal.with_data(correct_migration(signal.data, Frame.of(RADAR, signal), reference, migration, ambiguity))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "move, loss_db",
     [

@@ -80,6 +80,7 @@ def rotation(snr_db: float) -> tuple[Stage, Signal]:
 WORLDS = [strip, centroid, point, mover, lambda snr_db: mover(snr_db, "LikelihoodVelocity"), rotation]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("snr_db", [0.0, 15.0, 40.0])
 @pytest.mark.parametrize("world", WORLDS, ids=["velocity", "centroid", "point", "mover", "likelihood", "rotation"])
 def test_estimators_on_good_data(world: Callable[[float], tuple[Stage, Signal]], snr_db: float) -> None:

@@ -268,6 +268,7 @@ def batch_of_every_system(folder: Path) -> int:
     return len(costly)
 
 
+@pytest.mark.slow
 def test_a_batch_does_not_import_the_compiler_of_torch(tmp_path: Path) -> None:
     """It takes seconds in each process; torch.broadcast_shapes and torch.func.grad import it."""
     program = Program(batch_of_every_system, tmp_path, folder=tmp_path, said=tmp_path / "said.txt")

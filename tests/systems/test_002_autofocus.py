@@ -97,6 +97,7 @@ def test_polluted_entropies_are_those_of_the_reference(table_1, row, polluted):
     assert float(table_1[row]["polluted"].mean()) == pytest.approx(polluted, abs=0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("row", TABLE_1)
 def test_table_1(table_1, row):
     got = {name: float(value.mean()) for name, value in table_1[row].items()}
