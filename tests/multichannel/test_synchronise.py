@@ -134,6 +134,13 @@ def test_what_is_at_rest_shows_the_clock_phase():
         ClutterSynchronisation(RADAR, 320.0)(compressed_echo(RADAR, 2, 16, [{}]))
 
 
+def test_noise_does_not_shrink_the_delays():
+    delay = -1e-7 * torch.linspace(-1, 1, 256, dtype=torch.float64)
+    late = remove_synchronisation(clutter(RADAR, flat, 10.0, 3, 96), RADAR, torch.zeros(3, 256), -delay.expand(3, -1))
+    found = ClutterSynchronisation(RADAR, 320.0, snr_db=10.0)(Signal(late, RADAR.axes(256, 96)))["delay_s"]
+    assert float((found * delay).mean() / delay.square().mean()) == pytest.approx(1, abs=0.05)
+
+
 def test_refusals():
     signal = compressed_echo(RADAR, 8, 16, [{}])
     with pytest.raises(ValueError, match="each of the 8 pulses"):

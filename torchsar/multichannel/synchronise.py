@@ -173,14 +173,14 @@ def estimate_clutter_synchronisation(
         each = weight[..., block, :]
         moved, slope = _moved(later * turn.conj()[..., None, :, None], earlier, radar)
         along, square = each * moved, each * slope
-        value = {"phase_rad": _phase_without_line(turn), "delay_s": _delay(along.sum(-1), square.sum(-1))}
+        value = {"phase_rad": _phase_without_line(turn), "delay_s": _delay(along.sum(-1), square.sum(-1), radar)}
         if not assess:
             return Estimate(value, outcome=Outcome.NOT_ASSESSED.like(turn[..., 0].real))
         # standard deviations by a jackknife over four parts of the range cells: the change when a
         # part is left out, so that a part that dominates counts fully
         sums = [_part_sums(x) for x in (each * product, along, square)]
-        turns, *shifts = (x.sum(-2, keepdim=True) - x for x in sums)
-        left = {"phase_rad": _phase_without_line(torch.sgn(turns)), "delay_s": _delay(*shifts)}
+        turns, moved, slope = (x.sum(-2, keepdim=True) - x for x in sums)
+        left = {"phase_rad": _phase_without_line(torch.sgn(turns)), "delay_s": _delay(moved, slope, radar)}
         off = {name: left[name] - value[name][..., None, :] for name in value}
         spread = {name: (x.square().sum(-2).mean(-1) * (1 - 1 / x.shape[-2])).sqrt() for name, x in off.items()}
         blank = (sums[0] == 0).any(-1).any(-1)
@@ -205,17 +205,20 @@ def _moved(later: Tensor, earlier: Tensor, radar: BistaticRadar) -> tuple[Tensor
     """Compare pulses with their predictions in range, (..., channel, pulse, range) each.
 
     The delay of least squares between them is minus the first result over the second one, both
-    summed with weights over range cells, (..., pulse, range). It is small against a range cell.
+    summed with weights over range cells, (..., pulse, range). It is small against a range cell. The
+    second result is the power of the slope without that of the noise, which is independent in both.
     """
     hertz = radar.range_frequency_hz(later.shape[-1], later.device)
     rate = torch.where(hertz.abs() <= radar.pulse.bandwidth_hz / 2, 2j * math.pi * hertz, 0).to(later.dtype)
-    slope = torch.fft.ifft(torch.fft.fft((later + earlier) / 2) * rate)
-    return ((later - earlier) * slope.conj()).real.sum(-3), slope.abs().square().sum(-3)
+    late, early = (torch.fft.ifft(torch.fft.fft(x) * rate) for x in (later, earlier))
+    return ((later - earlier) * (late + early).conj()).real.sum(-3) / 2, (late * early.conj()).real.sum(-3)
 
 
-def _delay(moved: Tensor, slope: Tensor) -> Tensor:
-    """Add up the delays from pulse to pulse, and remove their mean, (..., pulse) in s."""
-    step = -(moved / slope.clamp_min(TINY)).to(torch.float64)
+def _delay(moved: Tensor, slope: Tensor, radar: BistaticRadar) -> Tensor:
+    """Add up the delays from pulse to pulse, each at most a range cell, and remove their mean,
+    (..., pulse) in s.
+    """
+    step = -(moved / torch.maximum(slope, moved.abs() * radar.pulse.bandwidth_hz + TINY)).to(torch.float64)
     delay = torch.nn.functional.pad(step.cumsum(-1), (1, 0))
     return delay - delay.mean(-1, keepdim=True)
 
