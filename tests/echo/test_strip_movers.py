@@ -138,3 +138,12 @@ def test_targets_without_an_echo_are_counted(place: tuple[float, float], count: 
     with pytest.warns(UserWarning, match="no target of the scene is recorded in 1 of 1") if count else nullcontext():
         recording, _ = simulate(radar, alone, 256, 256, Draws(1))
     assert bool((recording.signal.data != 0).any()) == (not count)
+
+
+def test_a_squinted_beam_sees_a_fast_mover_at_its_own_speed() -> None:
+    """It is closest twenty seconds after the record, where the speed decides its range."""
+    radar = StripmapRadar(3.2e9, LinearFM(40e6, 0.5e-6), 50e6, 400.0, 120.0, 4000.0)
+    fast = scene.MovingPoints([0.0], [60.0], [0.0], [200.0])
+    world = scene.StripmapWorld(AT_REST, scene.Dwell(0.6), doppler_hz=768.5, movers=fast)
+    recording, truth = simulate(radar, world, 256, 256, Draws(1))
+    assert bool((recording.signal.data != 0).any()) and int(truth.values["targets_outside"]) == 0

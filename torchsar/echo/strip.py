@@ -433,7 +433,7 @@ def _outside(
     """
     time_s = placed.crossing_s.clamp(0, (n_pulse - 1) / radar.prf_hz)
     velocity = per_trial(velocity_m_s, 1, time_s)
-    range_m = torch.hypot(placed.closest_m, velocity * (time_s - placed.zero_doppler_s))
+    range_m = torch.hypot(placed.closest_m, placed.speed_m_s(velocity) * (time_s - placed.zero_doppler_s))
     sample = (range_m - radar.near_range_m) / radar.range_step_m
     since_s = (time_s - placed.crossing_s)[..., None, :]
     lit = world.beam.weight(since_s, torch.zeros_like(since_s), velocity[..., None, :])[..., 0, :] > 0
