@@ -58,6 +58,8 @@ def test_channels_and_sweeps_share_their_errors_and_a_detector_records_the_real_
     block = Recording(Signal(torch.ones(4, 4096, dtype=torch.float64), detected), ladar)
     noted = Leakage(0.0, sample_cycles=0.1)(block, Draws(1))[0].signal.data - 1
     assert power(noted) == pytest.approx(1.0, rel=1e-3)
+    offset = Leakage(0.0)(block, Draws(1, trials=range(6)))[0].signal.data - 1  # whatever its random phase
+    torch.testing.assert_close(power(offset), torch.ones(6, dtype=torch.float64))
     with pytest.raises(ValueError, match="need complex samples, got real ones"):
         QuadratureError(1.0)(block, Draws(1))
 

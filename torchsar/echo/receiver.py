@@ -48,8 +48,9 @@ def _added(recording: Recording, wave: Tensor, over_signal_db: Tensor | float) -
     power = lines.abs().square().mean(dims, keepdim=True).to(torch.float64)
     power = power * 10 ** (per_trial(over_signal_db, -dims[0], lines) / 10)
     wave = _behind(recording, wave, 2)
-    # a detector with one channel records the real part, which has half of the power
-    wave = wave if lines.is_complex() else math.sqrt(2) * wave.real
+    # a detector with one channel records the real part, at the same level
+    norm, of_real = (torch.linalg.vector_norm(x, dim=(-2, -1), keepdim=True) for x in (wave, wave.real))
+    wave = wave if lines.is_complex() else wave.real * (norm / of_real.clamp_min(1e-300))
     wave = wave.to(lines.dtype) * power.sqrt().to(lines.real.dtype)
     return _with_lines(recording, lines + wave), power.flatten(dims[0])[..., 0]
 
