@@ -316,3 +316,8 @@ def test_places_without_a_point_have_no_widths() -> None:
         found = impulse_response(image, (torch.tensor([0.0, 12.0]), torch.zeros(2)), search_m=3.0)
     for name, value in found.items():
         assert torch.isfinite(value.abs()).tolist() == [True, name == "peak" or name.startswith("position")], name
+    weak = image.with_data(image.data + image.data.roll(30, -1) / 100)
+    with pytest.warns(UserWarning, match="for a weak target beside a stronger one choose fewer sidelobe_nulls"):
+        assert impulse_response(weak, (0.0, 30.0), sidelobe_nulls=20, search_m=1.0)["irw_azimuth_m"].isnan()
+    found = impulse_response(weak, (0.0, 30.0), sidelobe_nulls=4, search_m=1.0)
+    assert found["irw_azimuth_m"].item() == pytest.approx(1.77, abs=0.1)

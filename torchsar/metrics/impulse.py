@@ -69,7 +69,9 @@ def impulse_response(
         within `sidelobe_nulls`), `islr_A_db` (energy of the side lobes divided by that of the main
         lobe, null to null) and `position_A_m`; and `peak`, the complex interpolated peak. The
         shapes are those of `at_m` broadcast with the trials. Where a side lobe exceeds the peak,
-        there is no point response, and widths and side lobes are NaN; a warning says so.
+        there is no point response, and widths and side lobes are NaN; a warning says so. A weak
+        target in the same row or column as a stronger one is measured with so few `sidelobe_nulls`
+        that these do not reach the stronger one.
 
     Raises:
         ValueError: If the signal does not have two axes, is not finite, or a position lies outside
@@ -117,7 +119,8 @@ def impulse_response(
     if bool(lost.any()):
         warnings.warn(
             f"{int(lost.sum())} of {lost.numel()} places have no point response: what lies beside is stronger, and "
-            "their widths and side lobes are NaN; check the coordinates, or widen the search (search_m)",
+            "their widths and side lobes are NaN; check the coordinates, widen the search (search_m), or for a weak "
+            "target beside a stronger one choose fewer sidelobe_nulls",
             stacklevel=2,
         )
         kept = ("peak", *(f"position_{axis.name}_m" for axis in signal.axes))

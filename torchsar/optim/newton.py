@@ -132,8 +132,9 @@ def implicit(objective: Callable[..., Tensor], minimum: Tensor, *data: Any) -> T
 
     The value stays as it is, to the bit. The implicit function theorem gives its derivatives, those
     of one Newton step -H^-1 gradient at the minimum, with the Hessian H held constant. They are
-    zero in trials in which the Hessian is not positive definite, such as those at the end of a
-    search. If no derivative by the data is asked for, nothing is computed.
+    zero in trials in which the Hessian is not positive definite. They are those of a search without
+    bounds: at a bound, where the gradient is not zero, they are wrong. If no derivative by the data
+    is asked for, nothing is computed.
 
     Args:
         objective: Maps points (..., n) and the data to real costs (...,), each cost from its own

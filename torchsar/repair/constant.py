@@ -129,8 +129,11 @@ def remove_tones(x: Tensor, count: int = 4, least_excess: float = 20.0) -> Tenso
         x: Samples, shape (..., pulse, sample), complex.
         count: Largest number of tones.
         least_excess: Least power of the tone's cell of the spectrum over the mean power of the
-            other cells of its range frequency and of its Doppler frequency. Noise and clutter reach
-            12; where there are fewer pulses or samples than that, nothing is subtracted.
+            other cells of its range frequency and of its Doppler frequency. In noise it is near the
+            logarithm of the number of cells, 14 for a million, and also in clutter that fills the
+            band of range or of Doppler frequencies. In clutter that fills half of both bands it is
+            twice as large. Where there are fewer pulses or samples than this, nothing is
+            subtracted.
 
     Returns:
         Samples of the same shape.
