@@ -44,7 +44,8 @@ def remove_pulses(raw: Tensor, parts: int = 32, threshold: float = 3.0) -> Tenso
     True
 
     A part of a line is hit if it has clearly more energy than the median of the same part of the
-    lines nearby, as a pulse that lasts less than a line makes it in less than half of the lines.
+    lines nearby, as a pulse that lasts less than a line makes it in less than half of the lines. A
+    target of this power that is seen in fewer than 33 lines is taken for a pulse and removed too.
     Parts are filled as by `band_limited_fill`, which needs a Doppler band below the PRF.
     Interference that lasts whole lines is one for `subtract_interference`. Differentiable in the
     samples that are kept.
@@ -52,8 +53,8 @@ def remove_pulses(raw: Tensor, parts: int = 32, threshold: float = 3.0) -> Tenso
     Args:
         raw: Raw lines, shape (..., pulse, range), complex.
         parts: Number of parts of a line.
-        threshold: Least power of a part over the median of 65 lines; clutter reaches 2.5 in parts
-            of 12 samples.
+        threshold: Least power of a part over the median of 65 lines. Clutter reaches 2.5 in parts
+            of 12 samples; in parts of 2 samples it exceeds 3 in one of 25 parts.
 
     Returns:
         Lines of the same shape; parts that are not hit are unchanged.
