@@ -67,7 +67,7 @@ def test_every_command_works_on_it(
         return trials
 
     monkeypatch.setattr(toy_system.ToneSystem, "simulate", seen)
-    assert main(["list"]) == 0
+    assert main(["list", "--all"]) == 0
     assert "a tone in noise" in (said := capsys.readouterr().out) and "strongest_line" in said and "padding=8" in said
     _check_run(config, tmp_path / "run")
     batches.clear()
