@@ -69,6 +69,7 @@ def bound(width: float, snr_db: float) -> float:
     return float(torch.linalg.pinv(flat @ information @ flat, hermitian=True).diagonal().mean().sqrt())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("width", "snr_db", "kind", "centre", "points"),
     [

@@ -32,6 +32,7 @@ from torchsar.metrics import phase_rmse
 METHODS = [sca, pga, pga_sca, entropy_fixed_point, sharpest_phase, autofocus, link_phases, phase_polish]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_values_are_the_same_without_assessment(method, monkeypatch) -> None:
     data, _ = spread_points(3, 20, 10.0, seed=2)

@@ -321,6 +321,7 @@ def test_memory_layout_has_no_effect(name):
         torch.testing.assert_close(METHODS[name](other)["phase_rad"], want, atol=1e-12, rtol=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_a_trial_does_not_depend_on_its_batch(name):
     x, _ = scene(5, 5.0, n_pulse=100, n_range=48)

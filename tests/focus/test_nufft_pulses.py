@@ -121,6 +121,7 @@ def test_parts_of_the_trilinear_form_are_each_others_gradients():
     torch.testing.assert_close((trilinear("weights", 3, first, values, grid) * weights).sum(), total)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("taps", [4, 7])
 def test_two_derivatives_in_data_and_points(taps):
     plan = PulseNufft(6, Kernel(taps, 1.5), torch.complex128)

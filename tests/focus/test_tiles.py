@@ -513,6 +513,7 @@ def beside_a_track(pulses: int, counts: tuple[int, int], squint_deg: float, heig
     return Case(frequency, place, None, torch.full_like(x, 2236.0), grid, noise)
 
 
+@pytest.mark.slow
 def test_the_pulses_that_light_a_strip_decide_on_its_range_direction() -> None:
     """Most pulses of a path of 6 km see the middle of a strip at 1.1 km far ahead or behind."""
     drawn = beside_a_track(12_000, (128, 64), 0.0, None)

@@ -57,6 +57,7 @@ def pattern(f):
     return torch.sinc(0.8 * f / 300).square()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "prf, spacing_m, chosen, power, limit_deg",
     [

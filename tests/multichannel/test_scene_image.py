@@ -51,6 +51,7 @@ def ratio_db(a: torch.Tensor, b: torch.Tensor) -> float:
     return 10 * math.log10(float(a.abs().square().mean() / b.abs().square().mean()))
 
 
+@pytest.mark.slow
 def test_a_ship_is_found_removed_and_relocated() -> None:
     scene, still = made(), StationaryImage(RADAR)(scenes()[1])
     (body,) = scene.bodies

@@ -195,6 +195,7 @@ def deadly(parameters: dict, draws) -> dict:
     return toy.trial(parameters, draws)
 
 
+@pytest.mark.slow
 @needs_dask
 def test_a_batch_that_kills_its_workers_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(engines, "_DEATHS", 0)

@@ -106,6 +106,7 @@ def test_table_1(table_1, row):
     assert abs(got["entropy_fixed_point"]) < 0.05 and abs(got["autofocus"]) < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["sca", "pga_sca", "entropy_fixed_point", "autofocus"])
 def test_rows_of_table_1_are_the_same_for_methods_started_from_sca(table_1, name):
     """Noise-free, in complex128: only the scene matters, the kind and size of the error do not."""
