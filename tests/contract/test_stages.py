@@ -124,6 +124,7 @@ def test_state_moves_and_input_is_left_alone(case: Case) -> None:
     assert called(case).left_alone
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES, ids=IDS)
 def test_forward_mode_equals_reverse_mode(case: Case) -> None:
     stage, signal = case.build(), entering(case, raw(2, n_pulse=18, n_range=32))

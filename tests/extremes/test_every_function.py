@@ -193,6 +193,7 @@ def test_extreme_numbers(name: str) -> None:
             assert shown == math.isnan(number) or not found or name in MAY_DIFFER, (key, number)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", range(4))
 def test_random_cases(part: int) -> None:
     seeds = range(FIRST_SEED + part, FIRST_SEED + RANDOM_CASES, 4)
