@@ -1,5 +1,5 @@
-# make run: the embedded experiment. make test: the tests that take at most two seconds each, in JOBS processes of one
-# thread; make test-slow: the others; TESTS chooses files. All set up $(VENV) first.
+# make run: the embedded experiment. make test: the quick tests, in JOBS processes of one thread;
+# make test-slow: those marked slow; TESTS chooses files. All set up $(VENV) first.
 # make docs: the documentation site, in docs/_build/html; it works without a network.
 # make package: sdist and wheel, and the wheel used outside the repository as its users do.
 # An environment that already has torch keeps it: make run VENV=/path/to/venv

@@ -154,12 +154,8 @@ class Stage(nn.Module):
         """Check the arguments of a call and run `forward`."""
         name = type(self).__name__
         if not isinstance(signal, Signal):
-            whole = hasattr(signal, "signal")
-            hint = (
-                "pass its signal: recording.signal"
-                if whole
-                else ("wrap the tensor: Signal(data, radar.raw_axes(lines, samples))")
-            )
+            wrap = "wrap the tensor: Signal(data, radar.raw_axes(lines, samples))"
+            hint = "pass its signal: recording.signal" if hasattr(signal, "signal") else wrap
             raise TypeError(
                 f"{name} works on a Signal with the axes {self.works_on}, got {type(signal).__name__}; {hint}"
             )
