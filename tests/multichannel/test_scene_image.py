@@ -9,7 +9,7 @@ from functools import cache
 import pytest
 import torch
 
-from torchsar.core import Signal
+from torchsar.core import Outcome, Signal
 from torchsar.multichannel import (
     FlatBand,
     ImageMovers,
@@ -67,7 +67,7 @@ def test_a_ship_is_found_removed_and_relocated() -> None:
     estimate = scene.estimate
     assert (
         estimate is not None
-        and estimate.ok.tolist() == [True] + 7 * [False]
+        and estimate.outcome.tolist() == [Outcome.OK] + 7 * [Outcome.ABSENT]
         and float(estimate["u_r_m_s"][0]) == float(body.motion.u_r_m_s)
     )
     assert float(estimate["u_r_m_s"][1:].abs().max()) == 0
@@ -78,7 +78,8 @@ def test_trials_are_independent() -> None:
     sea, (body,) = scenes()[1], made().bodies
     both = flow()(sea.with_data(torch.stack([sea.data, scenes()[0].data])))
     assert [len(found) for found in both.bodies] == [0, 1] and both.fused.trials == both.data.trials == (2,)
-    assert both.estimate.ok.sum(-1).tolist() == [0, 1]
+    assert both.estimate.outcome[:, 0].tolist() == [Outcome.NOISE, Outcome.OK]
+    assert not bool(both.estimate.ok[0].any()) and both.estimate.ok.sum(-1).tolist() == [0, 1]
     assert float(both.estimate["u_r_m_s"][1, 0]) == pytest.approx(float(body.motion.u_r_m_s), abs=1e-3)
     torch.testing.assert_close(both.fused.data[1], made().fused.data, atol=1e-3, rtol=1e-4)
     known_ = flow()(both.data, known=[replace(known(), u_r_m_s=torch.tensor([8.0, 6.0], dtype=torch.float64))])

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from tests.study.scenes import FLOW, GEO_OCEAN, SHIP, bench_of, world
-from torchsar.core import Axis, Draws, Signal
+from torchsar.core import Axis, Draws, Outcome, Signal
 from torchsar.multichannel.motion import PointMotion
 from torchsar.study.commands.requires import refuse_beyond_limits
 from torchsar.study.systems.geo_ocean import figures
@@ -37,7 +37,8 @@ def test_every_ship_is_measured(tmp_path: Path) -> None:
     assert best["sea_error_before_db"] > best["sea_error_db"] + 18
     assert best["contrast_db"] > rest["contrast_db"] + 10 and abs(best["hole_db"]) < 3
     assert best["replica_left_db"] < -10
-    whole = outcomes["recommended"].metrics
+    whole, codes = outcomes["recommended"].metrics, outcomes["recommended"].marks["outcomes"]
+    assert codes["image"].tolist() == [Outcome.OK]  # places without a ship do not count
     assert float(whole["false_targets"]) == 0 and float(whole["condition_number"]) < 1.42
     assert float(whole["noise_gain_db"]) < 0.6
     found = bench.system.found(bench, outcomes["recommended"], bench.trials(Draws(1, "run", [0])))

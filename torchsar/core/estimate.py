@@ -49,6 +49,7 @@ class Outcome(IntEnum):
     SINGULAR = 31
     EMPTY = 32
     ERROR = 33
+    ABSENT = 34
 
     @property
     def message(self) -> str:
@@ -113,6 +114,7 @@ _MESSAGES = {
     Outcome.SINGULAR: "the data do not determine the values: use more of them, or fewer unknowns",
     Outcome.EMPTY: "there are no samples other than zero",
     Outcome.ERROR: "the method stopped with an error, which the log names",
+    Outcome.ABSENT: "no further target was found: this place of the list is empty",
 }
 
 

@@ -102,9 +102,9 @@ class SceneImage:
             order of the flattened trials.
         estimate: `u_r_m_s`, `u_a_m_s`, `y0_m`, `range_m` of the targets, (..., target). Each has as
             many entries as the detector may find targets (`Detector.most`); entries without a
-            target are zero, and their outcome is `NOISE`. Outcomes of targets are those of `Body`,
-            or `UNBALANCED` where the stationary clutter shows that the channels differ by as much
-            as a slant-range speed of 0.3 m/s.
+            target are zero, and their outcome is `ABSENT`, but `NOISE` if there is no target at
+            all. Outcomes of targets are those of `Body`, or `UNBALANCED` where the stationary
+            clutter shows that the channels differ by as much as a slant-range speed of 0.3 m/s.
         data: Channels from which the moving targets were removed.
     """
 
@@ -359,7 +359,7 @@ class ImageMovers(Stage):
             value,
             {"u_r_m_s": row([body.u_r_std_m_s for body in bodies])},
             level / (100.0 + level),  # the quality is one half at 20 dB, by convention
-            outcome.masked_fill(missing, Outcome.NOISE),
+            outcome.masked_fill(missing, Outcome.ABSENT if bodies else Outcome.NOISE),
             info={"level": level},
         )
 
@@ -470,9 +470,9 @@ class MoversImage(Stage):
         Returns:
             The images with every moving target at its true position, (..., azimuth, range), and the
             estimate of the motions with values of shape (..., target), padded with zeros to
-            `Detector.most` targets, whose outcome is `NOISE`. The `info` of the estimate holds
-            `level`, the ratio of the mean intensity of each target to the residual sea and noise (0
-            where there is no target), and the images `rest` and `conventional`, see `SceneImage`.
+            `Detector.most` targets, see `SceneImage`. The `info` of the estimate holds `level`, the
+            ratio of the mean intensity of each target to the residual sea and noise (0 where there
+            is no target), and the images `rest` and `conventional`, see `SceneImage`.
 
         Raises:
             ValueError: If some of the four values are missing, or as in `ImageMovers`.

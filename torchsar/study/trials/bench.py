@@ -245,7 +245,10 @@ class Bench:
             log.warning("warning: %s failed: %s", name, text)
             return Processed(Judged(verdict(codes)), failed=text, marks={"outcomes": codes})
         # the code 0, which is OK, is added for estimates without targets
-        codes = {stage: pad(rows(e.outcome, trials.count), (1, 0)).amax(1) for stage, e in estimates.items()}
+        codes = {
+            stage: pad(rows(e.outcome.where(e.outcome != Outcome.ABSENT, 0), trials.count), (1, 0)).amax(1)
+            for stage, e in estimates.items()
+        }
         spent = torch.full((trials.count,), sum(seconds.values()) / trials.count, dtype=torch.float64)
         measured = {key: rows(x.detach(), trials.count).double().mean(1) for key, x in trace.metrics.items()}
         judged = replace(judged, metrics={"seconds": spent, **verdict(codes), **judged.metrics, **measured})
