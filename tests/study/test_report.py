@@ -191,6 +191,15 @@ def test_cuts_show_ten_side_lobes_of_oversampled_responses() -> None:
     assert (line.abs() - torch.sinc(from_centre / width).abs()).abs().max() < 0.01
 
 
+def test_a_cut_beside_a_stronger_point_does_not_warn(recwarn: pytest.WarningsRecorder) -> None:
+    samples = torch.full((128, 64), 1e-3, dtype=torch.complex128)
+    samples[40, 30], samples[49, 30] = 1, 3
+    image = Signal(samples, (Axis("azimuth", 128, 0.0, 1.0, "m"), Axis("range", 64, 0.0, 1.0, "m")))
+    assert len(impulse_cuts(image, (40.0, 30.0))) == 2 and not recwarn.list
+    impulse_response(image, (40.0, 30.0))
+    assert "no point response" in str(recwarn.list[0].message)
+
+
 def test_interpolated_parts_agree_with_the_samples() -> None:
     n = 64
     spectrum = torch.zeros(n, dtype=torch.complex128)
