@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_map
 
 from tests.contract.pretended import DEVICE, Counts, Pretended, pretended_device, to_device, to_host
-from torchsar.focus import nufft
+from torchsar.core import nufft
 
 
 @dataclass(frozen=True)

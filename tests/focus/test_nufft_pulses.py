@@ -9,8 +9,8 @@ import math
 import pytest
 import torch
 
+from torchsar.core.nufft import Kernel
 from torchsar.focus.gridding import PulseNufft, trilinear
-from torchsar.focus.nufft import Kernel
 
 
 def noise(*shape, seed=1, dtype=torch.complex128):

@@ -210,8 +210,8 @@ def test_values_are_read_once_and_in_single_precision_only(monkeypatch):
     recording, _ = small_recording(16, 40, dtype=torch.complex128)
     given = {"radar": small_radar(), "doppler_hz": 0.0}
     plain = omega_k_stolt(recording.signal.data, **given)
-    for module in ("omega_k", "nufft"):
-        monkeypatch.setattr(importlib.import_module(f"torchsar.focus.{module}"), "host_largest", large)
+    for module in ("focus.omega_k", "core.nufft"):
+        monkeypatch.setattr(importlib.import_module(f"torchsar.{module}"), "host_largest", large)
     torch.testing.assert_close(omega_k_stolt(recording.signal.data, **given), plain, rtol=0, atol=0)
     assert not read
     single = omega_k_stolt(recording.signal.data.to(torch.complex64), **given)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Axis, per_trial, unit_phasor
-from torchsar.echo.sums import blocks, line_sum, line_tables
+from torchsar.echo.sums import LineSum, blocks
 from torchsar.radar import InverseRadar
 from torchsar.scene import Motion, PolynomialRotation, Scatterers
 from torchsar.scene.rotation import Rotation, rotation_angle
@@ -200,12 +200,12 @@ def _sum_of_lines(
     n, edge_s = len(fast_s), float(fast_s.abs().max())
     curve = 2 * math.pi * curve * edge_s**2
     weight = unit_phasor(start, dtype) * amplitude[..., None, :].to(dtype)
-    tables = line_tables(slope * (float(fast_s[1] - fast_s[0]) if n > 1 else 0.0), n, -(n // 2), dtype)
+    sum_of = LineSum(slope * (float(fast_s[1] - fast_s[0]) if n > 1 else 0.0), n, -(n // 2), dtype)
     u2 = (fast_s / edge_s).square() if edge_s else torch.zeros_like(fast_s)
-    total = line_sum(tables, weight, n)
+    total = sum_of(weight)
     for order in range(1, _series_terms(curve) + 1):
         term = curve.pow(order) / math.factorial(order)
-        total = total + line_sum(tables, weight * (term * 1j**order).to(dtype), n) * u2.pow(order).to(dtype)
+        total = total + sum_of(weight * (term * 1j**order).to(dtype)) * u2.pow(order).to(dtype)
     # the deviation of the motion also changes the phase between scatterers
     off_m = float(bend_m.detach().abs().max())
     worst = 2 * math.pi * float(bend.detach().abs().max()) * off_m
@@ -215,7 +215,7 @@ def _sum_of_lines(
             "can represent; shorten the pulse or slow the motion"
         )
     if worst > 1e-12:
-        total = total + line_sum(tables, weight * (2j * math.pi * bend).to(dtype), n) * bend_m.to(dtype)
+        total = total + sum_of(weight * (2j * math.pi * bend).to(dtype)) * bend_m.to(dtype)
     return total
 
 

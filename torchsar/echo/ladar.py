@@ -12,7 +12,7 @@ from torch import Tensor
 from torchsar.core import Draws, Recording, Truth, gathered_checks, host_largest, linear_phasor, real_dtype, unit_phasor
 from torchsar.echo.ladar_course import LadarCourse, calibration_aux, hand_over
 from torchsar.echo.recorded import Impairment, noise
-from torchsar.echo.sums import blocks, line_sum, line_tables
+from torchsar.echo.sums import LineSum, blocks, row_bytes
 from torchsar.radar import TriangularLadar, sweep_middles
 from torchsar.scene import EverySample, LadarWorld, LinearInSweep, Motion, Scatterers
 from torchsar.scene.ladar import SweepError
@@ -225,11 +225,11 @@ def _sum_of_lines(
     amplitude = s.amplitude[..., None, None, :].to(dtype) * lit
     table = None if error is None else _error_table(error, s, u, radar, dtype)
     n, parts = len(u), []
-    for pulses in blocks(lines.start.shape[-2], 2 * s.range_m.shape[-1] * 16 * 64):
+    for pulses in blocks(lines.start.shape[-2], 2 * row_bytes(s.range_m.shape[-1], n, dtype)):
         weight = unit_phasor(lines.start[..., pulses, :], dtype) * amplitude[..., pulses, :]
         turns = lines.slope[..., pulses, :] / radar.sample_rate_hz
         if table is None:
-            total = line_sum(line_tables(turns, n, -(n - 1) / 2, dtype), weight, n)
+            total = LineSum(turns, n, -(n - 1) / 2, dtype)(weight)
         else:
             total = _sum_with_errors(weight, turns, table)
         if lines.curve is not None:

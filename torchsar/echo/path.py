@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchsar.core import Draws, Recording, Truth, gathered_checks, per_trial, unit_phasor
 from torchsar.echo.recorded import Impairment, noise, recorded, with_samples
-from torchsar.echo.sums import blocks, echo_spectrum
+from torchsar.echo.sums import blocks, echo_spectrum, row_bytes
 from torchsar.radar import AntennaPath, InverseRadar, StraightTrack, frequency_samples, range_profiles
 from torchsar.scene import PathWorld, Sway
 from torchsar.scene.trials import refuse_other_trials
@@ -40,7 +40,8 @@ def path_echo(
 
     The sample of pulse p at the frequency f is the sum over the points of weight exp(-2j pi f (l -
     reference) / c) with the path l = |transmitter - x| + |x - receiver|. Antennas are at rest
-    during a pulse. The sum is a matrix product over blocks of frequencies (`echo_spectrum`).
+    during a pulse. Few points are summed by a matrix product over blocks of frequencies, more than
+    64 by a non-uniform FFT (`LineSum`).
     Differentiable in positions and weights.
 
     Args:
@@ -61,9 +62,9 @@ def path_echo(
     if n_frequency < 1 or not points_m.shape[-2]:
         raise ValueError(f"path_echo needs points and frequencies, got {points_m.shape[-2]} and {n_frequency}")
     lead = np.broadcast_shapes(antennas.trials, points_m.shape[:-2])
-    size = points_m.shape[-2] * max(1, round(2 * n_frequency**0.5)) * int(np.prod(lead)) * dtype.itemsize
+    size = row_bytes(points_m.shape[-2], n_frequency, dtype) * int(np.prod(lead))
     out = []
-    for pulses in blocks(antennas.pulses, size, 1 << 22):
+    for pulses in blocks(antennas.pulses, size):
         delay = antennas.path_m(points_m[..., None, :, :], pulses) / radar.wave_speed_m_s
         some = weight if weight.shape[-2] == 1 else weight[..., pulses, :]
         step_hz = radar.bandwidth_hz / n_frequency

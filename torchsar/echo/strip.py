@@ -15,7 +15,7 @@ from torch import Tensor
 from torchsar.core import Draws, Recording, Truth, gathered_checks, per_trial, power_of
 from torchsar.core.fft import smooth_length
 from torchsar.echo.recorded import Impairment, noise, recorded
-from torchsar.echo.sums import blocks, echo_spectrum
+from torchsar.echo.sums import blocks, echo_spectrum, row_bytes, summed_by_transform
 from torchsar.radar import StripmapRadar
 from torchsar.scene import GroundMovers, Scatterers, StripmapWorld
 from torchsar.scene.trials import refuse_other_trials
@@ -211,7 +211,9 @@ def _lines(
     spectrum = torch.fft.fftshift(radar.pulse.spectrum(n_fft, radar.sampling_hz, placed.closest_m.device)).to(dtype)
     lines = []
     slow_s = torch.arange(n_pulse, dtype=torch.float64, device=placed.closest_m.device) / radar.prf_hz
-    for pulses in blocks(n_pulse, 8 * n_fft, _TABLE_BYTES, 64):
+    many = summed_by_transform(placed.closest_m, n_fft)
+    row = row_bytes(placed.closest_m.shape[-1], n_fft, dtype) if many else 8 * n_fft
+    for pulses in blocks(n_pulse, row, _TABLE_BYTES, 64):
         block = _block_spectrum(placed, world, radar, slow_s[pulses], n_fft, dtype)
         lines.append(torch.fft.ifft(torch.fft.ifftshift(block * spectrum, dim=-1))[..., :n_range])
     return torch.cat(lines, -2)
@@ -225,7 +227,9 @@ def _block_spectrum(
     doppler = per_trial(_true_doppler(world, radar), 2, pulse_s)
     total = torch.zeros((*placed.closest_m.shape[:-1], pulse_s.numel(), n_fft), dtype=dtype, device=pulse_s.device)
     count = placed.closest_m.shape[-1]
-    width = max(16, _TABLE_BYTES // (8 * pulse_s.numel() * 3 * math.isqrt(n_fft)))
+    many = summed_by_transform(placed.closest_m, n_fft)
+    each = row_bytes(1, 0, dtype) if many else 8 * 3 * math.isqrt(n_fft)
+    width = max(16, _TABLE_BYTES // (pulse_s.numel() * each))
     for first in range(0, count, width):
         some = placed.chosen((..., None, slice(first, first + width)))
         since, weight = _times_and_gain(some, world, radar, pulse_s, doppler, velocity)
@@ -240,7 +244,7 @@ def _block_spectrum(
         inside = (delay > -radar.pulse.duration_s) & (delay < n_fft / radar.sampling_hz)
         amplitude = some.amplitude * torch.where(inside, weight, 0)
         turns = 2 * radar.carrier_hz / radar.wave_speed_m_s * range_m
-        total = total + echo_spectrum(delay, turns, amplitude, n_fft, radar.sampling_hz / n_fft, dtype)
+        total = total + echo_spectrum(delay, turns, amplitude, n_fft, radar.sampling_hz / n_fft, dtype, many)
     return total
 
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import checked_samples, real_dtype, unit_phasor
-from torchsar.focus.nufft import Nufft, Points, interpolate
+from torchsar.core.nufft import Nufft, Points, interpolate
 from torchsar.radar.antenna_path import AntennaPath, broadcast, refuse_unusable
 from torchsar.radar.spotlight import frequency_step_hz
 from torchsar.radar.stripmap import LIGHT_M_S

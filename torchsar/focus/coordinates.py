@@ -7,8 +7,8 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchsar.core import Signal, Stage, checked_samples, real_dtype
+from torchsar.core.nufft import Nufft
 from torchsar.core.select import per_trial
-from torchsar.focus.nufft import Nufft
 from torchsar.focus.omega_k import Focuser
 from torchsar.radar import StripmapRadar
 

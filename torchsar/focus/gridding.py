@@ -30,7 +30,7 @@ from torch import Tensor
 from torch.nn.functional import embedding_bag
 
 from torchsar.core import block_bytes_of, host_largest, host_value, is_traced, over_blocks, real_dtype
-from torchsar.focus.nufft import Kernel
+from torchsar.core.nufft import Kernel
 
 # the three factors of the trilinear form, in the order of the arguments of `_Trilinear`
 _PARTS = ("weights", "values", "grid")

@@ -52,11 +52,11 @@ from torch.nn.functional import pad
 
 from torchsar.core import checked_samples, unit_phasor
 from torchsar.core.fft import smooth_length
+from torchsar.core.nufft import Kernel, Nufft, Points
 from torchsar.focus.backprojection import direct_sum, expanded_history
 from torchsar.focus.frame_geometry import BAND_EDGE
 from torchsar.focus.gridding import PulseNufft
 from torchsar.focus.image_grid import ImageGrid
-from torchsar.focus.nufft import Kernel, Nufft, Points
 from torchsar.focus.omega_k import STATIONARY_TURNS
 from torchsar.focus.processed_beam import ProcessedBeam
 from torchsar.focus.stolt import omega_k_stolt

@@ -23,8 +23,8 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Axis, block_bytes_of, real_dtype, unit_phasor
+from torchsar.core.nufft import Nufft, cropped, embedded
 from torchsar.focus.gridding import LinearMap
-from torchsar.focus.nufft import Nufft, cropped, embedded
 from torchsar.focus.spotlight import GroundImager, aperture_weights, refuse_other_size
 from torchsar.radar.spotlight import FarField, Spotlight, frequency_samples, range_profiles
 

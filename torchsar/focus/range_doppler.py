@@ -17,8 +17,8 @@ from torchsar.core import (
     to_frequency,
     unit_phasor,
 )
+from torchsar.core.nufft import Nufft, Points
 from torchsar.focus.frame_geometry import FrameGeometry
-from torchsar.focus.nufft import Nufft, Points
 from torchsar.focus.omega_k import STATIONARY_TURNS, Focuser, refocus_turns_per_sample, through_doppler
 from torchsar.radar import StripmapRadar
 

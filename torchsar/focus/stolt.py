@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from torchsar.core import checked_samples, real_dtype
+from torchsar.core.nufft import Nufft, Points
 from torchsar.focus.frame_geometry import FrameGeometry
-from torchsar.focus.nufft import Nufft, Points
 from torchsar.focus.omega_k import (
     Focuser,
     FrequencyBasis,

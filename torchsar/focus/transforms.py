@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torchsar.focus.nufft import Kernel
+from torchsar.core.nufft import Kernel
 from torchsar.focus.warped_sums import PulsesToLines, Sum, compiled, explicit, gridded, resampled
 
 

@@ -28,10 +28,10 @@ import torch
 from torch import Tensor
 
 from torchsar.core import block_bytes_of, linear_phasor, numbers_on
+from torchsar.core.nufft import Kernel, cropped
 from torchsar.core.spline import second_differences
 from torchsar.focus.chirp_z import chirp_z
 from torchsar.focus.gridding import PulseNufft
-from torchsar.focus.nufft import Kernel, cropped
 from torchsar.radar.warp import warp, warp_rate
 
 
