@@ -15,6 +15,7 @@ import pytest
 import torch
 import yaml
 
+from tests.program import Program
 from tests.study.tiny import TINY
 from torchsar.cli import main
 from torchsar.compensate import EnergyCentre
@@ -81,22 +82,24 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def killed_in(task: Callable[[], Any], block: int) -> None:
-    """Run a task in a process that is killed while it writes a block of the image."""
-    child = os.fork()
-    if not child:
-        write, count = StripImage.write, iter(range(100))
+def dying(folder: Path, out: str, block: int) -> int:
+    """The program that is killed while it writes a block of the image."""
+    write, count = StripImage.write, iter(range(100))
 
-        def dying(self: StripImage, lines: slice, image: torch.Tensor, raw: int) -> None:
-            if next(count) == block:
-                self.array[lines.start : lines.start + 100] = 7.0  # a part of a block that is not marked
-                os.kill(os.getpid(), signal.SIGKILL)
-            write(self, lines, image, raw)
+    def writing(self: StripImage, lines: slice, image: torch.Tensor, raw: int) -> None:
+        if next(count) == block:
+            self.array[lines.start : lines.start + 100] = 7.0  # a part of a block that is not marked
+            os.kill(os.getpid(), signal.SIGKILL)
+        write(self, lines, image, raw)
 
-        StripImage.write = dying  # type: ignore[method-assign]
-        task()
-        os._exit(1)
-    assert os.waitpid(child, 0)[1] == signal.SIGKILL
+    StripImage.write = writing  # type: ignore[method-assign]
+    return focus(folder, out)
+
+
+def killed_in(folder: Path, out: str, block: int) -> None:
+    """Run it in a process of its own: a fork of this one would lack the threads of zarr."""
+    program = Program(dying, folder, out, block, folder=folder, said=folder / "said.txt")
+    assert program.wait() == -signal.SIGKILL, program.said
 
 
 def test_the_image_is_that_of_one_transform_below_minus_60_db(folder: Path) -> None:
@@ -118,14 +121,14 @@ def test_the_image_is_that_of_one_transform_below_minus_60_db(folder: Path) -> N
 @pytest.mark.slow
 def test_a_killed_program_goes_on_with_the_same_bits(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert focus(folder, "whole") == 0
-    killed_in(lambda: focus(folder, "out"), 3)
+    killed_in(folder, "out", 3)
     assert not (folder / "out" / "quick_look.png").exists()
     capsys.readouterr()
     assert focus(folder, "out") == 2 and "holds an image already; add --resume" in said(capsys)
     assert focus(folder, "out", "--resume") == 0
     one, other = (StripImage(folder / name / "image.zarr").array[...] for name in ("whole", "out"))
     assert np.array_equal(one, other)
-    killed_in(lambda: focus(folder, "early"), 0)  # no block is finished: nothing is lost
+    killed_in(folder, "early", 0)  # no block is finished: nothing is lost
     assert focus(folder, "early") == 0
     assert np.array_equal(one, StripImage(folder / "early" / "image.zarr").array[...])
 
@@ -133,7 +136,7 @@ def test_a_killed_program_goes_on_with_the_same_bits(folder: Path, capsys: pytes
 def test_an_image_of_other_data_or_another_config_is_not_continued(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    killed_in(lambda: focus(folder, "out"), 3)
+    killed_in(folder, "out", 3)
     iq = np.load(folder / "raw.npz")["iq"]
     iq[500, 7, 0] += 1  # in the second block
     other = recording(folder / "other.npz", iq=iq)
@@ -236,7 +239,7 @@ def test_estimates_from_the_middle_hold_for_the_whole_strip(folder: Path, capsys
         text.replace("doppler_hz: -3000.0", "uses: {doppler_hz: doppler.doppler_baseband_hz}"),
         encoding="utf-8",
     )
-    killed_in(lambda: focus(folder, "out"), 2)
+    killed_in(folder, "out", 2)
     assert focus(folder, "out", "--resume") == 0
     assert "estimates from lines" not in capsys.readouterr().err.partition("finished")[0].split("--resume")[-1]
     values = StripImage(folder / "out" / "image.zarr").about["values"]

@@ -121,7 +121,7 @@ class _Strip:
 
     def focused(self, folder: ResultFolder, resume: bool) -> StripImage:
         """Compute the image in the folder; finished blocks are only checked."""
-        path = folder.path / "image.zarr"
+        path = folder.store("image.zarr")
         if path.exists() and not folder.claimed:
             raise ConfigError(f"--out {folder.path}: torchsar focus did not write {path.name}; choose another folder")
         image = StripImage(path, "r+") if StripImage.is_begun(path) else None

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import io
+import shutil
 import tracemalloc
 import warnings
 import zipfile
+import zlib
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from scipy.io import savemat
 
 from torchsar.cli import main
 from torchsar.core import Recording, stored
-from torchsar.io import read_inverse, read_path, read_stripmap
+from torchsar.io import import_recording, read_array, read_inverse, read_path, read_stripmap
 
 Members = dict[str, np.ndarray]
 Reader = Callable[[Path], Recording]
@@ -251,3 +255,54 @@ def test_numbers_keep_the_digits_that_the_chosen_type_can_hold(tmp_path: Path) -
     assert bool((data == complex(fine[0, 0, 0], fine[0, 0, 0])).all())
     path.write_bytes(packed({**PROFILES, "profiles": PROFILES["profiles"].astype(np.clongdouble)}))
     np.testing.assert_array_equal(read_inverse(path, torch.complex128).signal.data.T, PROFILES["profiles"])
+
+
+PLAN = {"system": "stripmap", "samples": {"name": "iq", "dims": ["pulse", "range", "iq"]}}
+
+
+def imported(path: Path) -> str:
+    """The sentence with which an import of a file of samples is refused."""
+    sidecar = {**PLAN, "radar": {name: float(STRIPMAP[name]) for name in ("fs_hz", "prf_hz", "f0_hz")}}
+    sidecar["radar"] |= {"chirp_rate_hz_s": -0.72e12, "pulse_s": 1e-7, "slant_range_cell1_m": 9e3, "v_eff_m_s": 7e3}
+    with pytest.raises(ValueError, match=path.name) as error:
+        import_recording(path, sidecar, path.with_name("new.npz"))
+    assert not path.with_name("new.npz").exists()
+    return str(error.value)
+
+
+def test_a_compressed_matlab_variable_is_checked_before_it_is_unpacked(tmp_path: Path) -> None:
+    path, text = tmp_path / "data.mat", io.BytesIO()
+    savemat(text, {"iq": np.zeros((12, 40, 2), np.int8)})
+    whole = bytearray(text.getvalue())
+    whole[132:136] = (len(whole) - 136 + (1 << 25)).to_bytes(4, "little")  # the size that the variable states
+    content = zlib.compress(bytes(whole[128:]) + bytes(1 << 25))
+    path.write_bytes(whole[:128] + b"\x0f\0\0\0" + len(content).to_bytes(4, "little") + content)
+    tracemalloc.start()
+    said = imported(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert "iq is damaged, since" in said and "of its shape (12, 40, 2)" in said and peak < 1 << 22
+
+
+def test_numbers_that_hdf5_invents_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    h5py = pytest.importorskip("h5py", reason="the extra `formats` is not installed")
+    path = tmp_path / "data.h5"
+    for chunks, found in (((6, 40, 2), "1 of its 2 parts"), (None, "0 of its 1 parts")):
+        with h5py.File(path, "w") as file:
+            held = file.create_dataset("iq", (12, 40, 2), np.int8, chunks=chunks)
+            if chunks:
+                held[:6] = 1
+        assert f"was not written as a whole, since the file has {found}" in imported(path)
+    with h5py.File(path, "w") as file:
+        file["iq"] = STRIPMAP["iq"]
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=100))
+    assert "becomes an archive of 3.84e-06 GB, and 1e-07 GB are free" in imported(path)
+
+
+def test_a_picture_beyond_the_memory_is_refused_by_its_header(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pillow = pytest.importorskip("PIL.Image")
+    pillow.new("L", (300, 200)).save(tmp_path / "a.png")
+    assert read_array(tmp_path / "a.png").shape == (200, 300)
+    monkeypatch.setattr(stored, "machine_memory_bytes", lambda: 1500)
+    with pytest.raises(ValueError, match=r"a.png: float64 of shape \(200, 300\) takes"):
+        read_array(tmp_path / "a.png")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import random
 from pathlib import Path
 
 import numpy as np
@@ -170,3 +172,51 @@ def test_data_without_a_place_on_the_earth_are_refused(
     pytest.importorskip("sarkit", reason="the extra `formats` is not installed")
     for run, form in ((strip, "cphd"), (flown, "sicd")):
         assert "the recording does not say where on the Earth it lies" in refused(run, form, tmp_path, capsys)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Path:
+    """A small store of the arrays of a run."""
+    axes = (Axis("azimuth", 9, -0.1, 0.3, "m"), Axis("range", 7, 1 / 3, 0.7, "m"))
+    image = Signal(torch.randn(9, 7, dtype=torch.complex64), axes)
+    write_arrays(
+        tmp_path / "a.zarr",
+        {"r": image, "zero": Signal(0 * image.data, axes)},
+        {"x": torch.ones(2)},
+        {"r": {"s": torch.ones(1)}},
+    )
+    return tmp_path / "a.zarr"
+
+
+def refused_by_sentence(store: Path) -> None:
+    with pytest.raises((ValueError, FileNotFoundError), match=r"a\.zarr") as error:
+        read_images(store)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.slow
+def test_any_flipped_bit_of_a_run_is_found(store: Path) -> None:
+    source, files = random.Random(5), sorted(path for path in store.rglob("*") if path.is_file())
+    for _ in range(400):
+        path = source.choice(files)
+        data = bytearray(whole := path.read_bytes())
+        data[source.randrange(len(data))] ^= 1 << source.randrange(8)
+        path.write_bytes(data)
+        refused_by_sentence(store)
+        path.write_bytes(whole)
+    assert read_images(store).keys() == {"r", "zero"}
+
+
+def test_any_missing_or_strange_file_of_a_run_is_found(store: Path) -> None:
+    for path in sorted(path for path in store.rglob("*") if path.is_file()):
+        whole = path.read_bytes()
+        path.unlink()
+        refused_by_sentence(store)
+        os.mkfifo(path)  # reading from it would wait for ever
+        refused_by_sentence(store)
+        path.unlink()
+        path.symlink_to("/dev/zero")
+        refused_by_sentence(store)
+        path.unlink()
+        path.write_bytes(whole)
+    assert read_images(store).keys() == {"r", "zero"}

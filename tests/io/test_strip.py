@@ -71,6 +71,9 @@ def test_an_image_is_read_as_it_was_written(tmp_path):
 def test_parts_are_whole_multiples_and_small(tmp_path, monkeypatch):
     monkeypatch.setattr("torchsar.io.strip._PART_BYTES", 250 * 30 * 8)
     image = begun(tmp_path / "a.zarr")
+    with pytest.raises(ValueError, match=r"a\.zarr.* 0 of 7 chunks of 'image' are there; finish"):
+        next(image.parts())
+    image.write(slice(0, 700), torch.zeros(700, 30, dtype=torch.complex64), 0)
     assert [part.data.shape[0] for _, part in image.parts(7)] == [245, 245, 210]
     assert [part.data.shape[0] for _, part in image.parts()] == [200, 200, 200, 100]  # whole chunks
     assert [part.data.shape[0] for _, part in image.parts(400)] == [400, 300]
@@ -96,5 +99,5 @@ def test_another_image_or_a_damaged_one_is_refused(tmp_path):
         StripImage(tmp_path / "none")
     read_other = tmp_path / "other.zarr"
     pytest.importorskip("zarr").open_group(str(read_other), mode="w", zarr_format=3)
-    with pytest.raises(ValueError, match="was not written by this version of torchsar focus"):
+    with pytest.raises(ValueError, match="was not written by this version of torchsar"):
         StripImage(read_other)

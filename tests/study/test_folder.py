@@ -10,6 +10,7 @@ import random
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -333,3 +334,23 @@ def test_a_state_behind_a_link_is_refused(which: str, out: Path) -> None:
     with pytest.raises(ConfigError, match="is a link"), fresh_result(out, "run", NAMES):
         pass
     assert (other / "mine.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize("name", ["lock", "manifest.json", "manifest.json.part"])
+@pytest.mark.parametrize("kind", ["link", "link to nothing", "pipe"])
+def test_no_file_of_the_state_leads_outside(name: str, kind: str, out: Path) -> None:
+    outside = out.parent / "notes.txt"
+    outside.write_text("of another project")
+    path = out / STATE / name
+    path.unlink(missing_ok=True)
+    os.mkfifo(path) if kind == "pipe" else path.symlink_to(outside if kind == "link" else out.parent / "planted")
+    with suppress(ConfigError), fresh_result(out, "run", NAMES) as folder:
+        (folder / "report.html").write_text("new")
+    assert outside.read_text() == "of another project" and not (out.parent / "planted").exists()
+
+
+def test_a_store_behind_a_link_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "s").mkdir()
+    (tmp_path / "s" / "results.zarr").symlink_to(tmp_path / "other")
+    with opened(tmp_path / "s", "sweep") as folder, pytest.raises(ConfigError, match="results.zarr is a link"):
+        folder.store("results.zarr")

@@ -298,7 +298,7 @@ def test_a_store_of_an_earlier_layout_is_refused_with_a_sentence(
         patch.setattr("torchsar.study.montecarlo.store.FORMAT", 2)
         toy.run(tmp_path / "s", trials=4)
     for again in (lambda: read_sweep(tmp_path / "s"), lambda: toy.run(tmp_path / "s", trials=4, resume=True)):
-        with pytest.raises(ConfigError, match=r"this version of torchsar \(its layout is 2, not 3\); choose another"):
+        with pytest.raises(ConfigError, match=r"this version of torchsar \(its layout is 2, not 4\); choose another"):
             again()
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import errno
 import json
+import random
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -397,3 +398,28 @@ def test_a_trial_that_ends_the_program_is_named() -> None:
 
     with pytest.raises(ConfigError, match=r"trials 0 to \d+ of .* failed: SystemExit: 0"):
         run(function=leaves)
+
+
+def test_an_error_names_the_line_of_the_function(tmp_path: Path) -> None:
+    def fails(parameters: Any, draws: Any) -> Any:
+        x = draws.normal("x", (3,))
+        return {"error_m": x @ torch.ones(4)}  # this line
+
+    text = Path(__file__).read_text(encoding="utf-8").split("\n")
+    line = 1 + next(i for i, one in enumerate(text) if one.endswith("# this line"))
+    with pytest.raises(
+        ConfigError, match=rf"RuntimeError: size mismatch.* \(line {line} of \S*test_sweep_attacks\.py\)"
+    ):
+        sweep(fails, {"a": [1.0]}, trials=2)
+
+
+@pytest.mark.parametrize("drawn", [torch.rand, np.random.rand, lambda n: [random.random() for _ in range(n)]])
+def test_numbers_of_a_global_generator_are_warned_of(drawn: Any, caplog: pytest.LogCaptureFixture) -> None:
+    def trial(parameters: Any, draws: Any) -> Any:
+        return {"error_m": torch.as_tensor(drawn(len(draws.trials))), "other_m": draws.normal("x", ())}
+
+    sweep(trial, {"a": [1.0]}, trials=8, chunk=2)
+    assert caplog.text.count("trials draw random numbers from a global generator") == 1
+    caplog.clear()
+    sweep(lambda parameters, draws: {"other_m": draws.normal("x", ())}, {"a": [1.0]}, trials=8)
+    assert "global generator" not in caplog.text

@@ -34,6 +34,25 @@ def machine_memory_bytes() -> int | None:
         return None
 
 
+def refuse_beyond_memory(what: str, shape: tuple[int, ...], dtype: np.dtype) -> None:
+    """Check, before an array is loaded, that the main memory can hold it and a converted copy.
+
+    Args:
+        what: Path of the file and name of the array, for the message.
+        shape: Its shape.
+        dtype: Type of its numbers.
+
+    Raises:
+        ValueError: If it cannot.
+    """
+    size, memory = math.prod(shape) * dtype.itemsize, machine_memory_bytes()
+    if memory is not None and 2 * size > memory:
+        raise ValueError(
+            f"{what}: {dtype} of shape {shape} takes {size / 1e9:.3g} GB, twice as much with a converted copy, and "
+            f"this machine has {memory / 1e9:.3g} GB; cut the array into parts"
+        )
+
+
 @dataclass(frozen=True)
 class StoredArray:
     """Array in a file that has not been loaded.
@@ -74,12 +93,7 @@ class StoredArray:
         """
         if kinds and self.dtype.kind not in kinds:
             raise ValueError(f"{self.what} must hold {'' if 'c' in kinds else 'real '}numbers, got {self.described}")
-        size, memory = math.prod(self.shape) * self.dtype.itemsize, machine_memory_bytes()
-        if memory is not None and 2 * size > memory:
-            raise ValueError(
-                f"{self.what}: {self.described} takes {size / 1e9:.3g} GB, twice as much with a converted copy, and "
-                f"this machine has {memory / 1e9:.3g} GB; cut the array into parts"
-            )
+        refuse_beyond_memory(self.what, self.shape, self.dtype)
         try:
             with self.opened() as stream, np.errstate(over="ignore"):
                 return np.lib.format.read_array(stream, allow_pickle=False).astype(self._kept, copy=False)

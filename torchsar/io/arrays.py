@@ -10,7 +10,12 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Axis, Signal
+from torchsar.core.stored import refuse_beyond_memory
 from torchsar.io.extras import library, reading
+from torchsar.io.seal import files_checksum, group_attributes, plain_files, sealed
+
+# chunks of zeros are written as well, so that a missing chunk is known to be lost
+WRITE_ALL = {"write_empty_chunks": True}
 
 
 def write_arrays(
@@ -44,6 +49,7 @@ def write_arrays(
             inner = group.create_group(method)
             for name, value in values.items():
                 put(inner, name, value)
+    seal_files(root, Path(path))
 
 
 def read_images(path: str | Path) -> dict[str, Signal]:
@@ -66,13 +72,14 @@ def read_images(path: str | Path) -> dict[str, Signal]:
     Raises:
         FileNotFoundError: If there is no such store.
         ModuleNotFoundError: If zarr is not installed (extra `study`).
-        ValueError: If the store is damaged.
+        ValueError: If any file of the store is damaged, missing or no plain file.
     """
     path = Path(path)
     if not (path / "zarr.json").is_file():
         raise FileNotFoundError(f"{path} holds no images; give the store of a run, arrays.zarr in its folder")
     zarr = library("zarr", "study", f"reading {path}")
     with reading(path, "the arrays of a run"):
+        refuse_changed_files(path)
         return dict(_images(zarr, zarr.open_group(str(path), mode="r"), ""))
 
 
@@ -82,9 +89,67 @@ def _images(zarr: Any, group: Any, name: str) -> Iterator[tuple[str, Signal]]:
     if isinstance(image, zarr.Array):
         held = [(axis, group[axis]) for axis in image.metadata.dimension_names]
         axes = (Axis(axis, x.shape[0], float(x[0]), float(x.attrs["step"]), str(x.attrs["unit"])) for axis, x in held)
+        refuse_missing_chunks(image)
+        refuse_beyond_memory(image.name, image.shape, image.dtype)
         yield name, Signal(torch.from_numpy(image[...]), tuple(axes))
     for below, inner in sorted(group.groups()):
         yield from _images(zarr, inner, f"{name}/{below}".strip("/"))
+
+
+def seal_files(root: Any, path: Path, free: str = "", **attributes: Any) -> None:
+    """Give the root of a store attributes, and a checksum of all files of the store.
+
+    Args:
+        root: Open zarr group.
+        path: Folder of the store.
+        free: Folder of the store whose files may change, such as "image/c".
+        **attributes: Values that JSON can hold.
+    """
+    root.update_attributes(sealed({**attributes, "free": free, "files": _checksum_of(path, free)}))
+
+
+def refuse_changed_files(path: Path) -> dict[str, Any]:
+    """Check the files of a store against the checksum that `seal_files` gave it.
+
+    Args:
+        path: Folder of the store.
+
+    Returns:
+        The attributes of the root.
+
+    Raises:
+        ValueError: If a file was changed, added or removed, or is no plain file.
+    """
+    held = group_attributes(path)
+    if not {"free", "files"} <= {*held}:
+        raise ValueError("it has no checksum of its files, and was not written by this version of torchsar")
+    if held["files"] != _checksum_of(path, held["free"]):
+        raise ValueError("its files differ from their checksum, since one of them is damaged, missing or replaced")
+    return held
+
+
+def refuse_missing_chunks(array: Any) -> None:
+    """Check that an array has all of its chunks, since zarr reads a missing one as zeros.
+
+    Args:
+        array: The array.
+
+    Raises:
+        ValueError: If a chunk is missing.
+    """
+    if array.nchunks_initialized < array.nchunks:
+        raise ValueError(
+            f"{array.nchunks_initialized} of {array.nchunks} chunks of {array.basename!r} are there; finish it by "
+            "torchsar focus --resume, or restore what is missing"
+        )
+
+
+def _checksum_of(path: Path, free: str) -> str:
+    """Checksum of all files but the metadata of the root, which hold it, and those that may
+    change.
+    """
+    kept = [file for file in plain_files(path) if not (free and file.is_relative_to(path / free))]
+    return files_checksum(path, [file for file in kept if file != path / "zarr.json"])
 
 
 def put(group: Any, name: str, value: Tensor, dims: tuple[str, ...] | None = None, **attributes: Any) -> None:
@@ -99,7 +164,6 @@ def put(group: Any, name: str, value: Tensor, dims: tuple[str, ...] | None = Non
     """
     data = torch.as_tensor(value).detach().cpu().resolve_conj().numpy()
     chunks = tuple(min(n, 1024) for n in data.shape)
-    array = group.create_array(
-        name, shape=data.shape, dtype=data.dtype, chunks=chunks or "auto", dimension_names=dims, attributes=attributes
-    )
+    made = {"shape": data.shape, "dtype": data.dtype, "chunks": chunks or "auto", "config": WRITE_ALL}
+    array = group.create_array(name, dimension_names=dims, attributes=attributes, **made)
     array[...] = data

@@ -9,12 +9,14 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from torchsar.core import ArrayFile
+from torchsar.core.stored import refuse_beyond_memory
 from torchsar.io.extras import library, reading
 from torchsar.io.fields import complex_type, joined, refuse_absent
 from torchsar.io.matlab import MatlabFile
@@ -64,6 +66,8 @@ class BlockArray:
             ValueError: If the file is damaged or cut off.
         """
         with reading(self.path, self.kind):
+            if not part:
+                refuse_beyond_memory(self.what, self.shape, self.dtype)
             return np.asarray(self.part(part)).astype(self.dtype.newbyteorder("="), copy=False)
 
 
@@ -149,7 +153,7 @@ def open_container(path: Path, stack: ExitStack) -> Container | None:
     if start.startswith(b"MATLAB 5.0"):
         with reading(path, "MATLAB 5"):
             variables = MatlabFile(path)
-        return Container(path, "MATLAB 5", lambda name: _whole(variables.load(name)), lambda: variables.names)
+        return Container(path, "MATLAB 5", lambda name: _later(*variables.find(name)), lambda: variables.names)
     # The signature of HDF5 is at one of these byte positions, after a header of another program,
     # such as MATLAB.
     hdf5 = any(start.startswith(b"\x89HDF\r\n\x1a\n", at) for at in (0, 512, 1024, 2048))
@@ -157,10 +161,10 @@ def open_container(path: Path, stack: ExitStack) -> Container | None:
         return _hdf5(path, stack, start.startswith(b"MATLAB"))
     if start.startswith((b"\x93NUMPY", b"PK\x03\x04")):
         held = ArrayFile(path)
-        return Container(path, "numpy", lambda name: _whole(held[name].load()), lambda: held)
+        return Container(path, "numpy", lambda name: _later(held[name], held[name].load), lambda: held)
     if path.suffix.lower() in (".csv", ".txt"):
         columns = read_table(path)
-        return Container(path, "table", lambda name: _whole(_columns(columns, name)), lambda: columns)
+        return Container(path, "table", lambda name: _later(x := _columns(columns, name), lambda: x), lambda: columns)
     return None
 
 
@@ -217,8 +221,11 @@ def _hdf5(path: Path, stack: ExitStack, matlab: bool) -> Container:
     def find(name: str) -> tuple[Any, Callable[[Slices], np.ndarray]]:
         place, at, attribute = name.partition("@")
         if at:
-            return _whole(np.asarray(file[place or "/"].attrs[attribute]))
+            value = np.asarray(file[place or "/"].attrs[attribute])
+            return _later(value, lambda: value)
         held = file[name]
+        if isinstance(held, h5py.Dataset):
+            _refuse_unwritten(held, path)
         if not matlab or not isinstance(held, h5py.Dataset):
             return held, lambda slices: held[slices]
         full = [slice(None)] * held.ndim
@@ -233,6 +240,22 @@ def _hdf5(path: Path, stack: ExitStack, matlab: bool) -> Container:
     return Container(path, kind, find, names)
 
 
-def _whole(array: Any) -> tuple[Any, Callable[[Slices], np.ndarray]]:
-    """Pair an array in memory with a function that returns parts of it."""
-    return array, lambda slices: array[slices]
+def _refuse_unwritten(held: Any, path: Path) -> None:
+    """Raise ValueError if parts of a dataset have no numbers in the file, which may be far larger
+    than the file.
+    """
+    if held.is_virtual or held.external or not held.size:
+        return
+    chunks = math.prod(-(-n // chunk) for n, chunk in zip(held.shape, held.chunks)) if held.chunks else 1
+    written = held.id.get_num_chunks() if held.chunks else int(held.id.get_storage_size() > 0)
+    if written < chunks:
+        raise ValueError(
+            f"{path}: {held.name} of shape {held.shape} was not written as a whole, since the file has {written} of "
+            f"its {chunks} parts; write zeros where samples are missing"
+        )
+
+
+def _later(array: Any, load: Callable[[], np.ndarray]) -> tuple[Any, Callable[[Slices], np.ndarray]]:
+    """Pair an array, or its type and shape, with a function that loads it once for its parts."""
+    whole = cache(load)
+    return array, lambda slices: whole()[slices]

@@ -9,14 +9,15 @@ from __future__ import annotations
 import math
 import re
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from torchsar.io.fields import joined
+from torchsar.core.stored import refuse_beyond_memory
+from torchsar.io.fields import complex_type, joined
 
 # numbers fixed by the format: types of elements, class of structures, and flag of complex numbers
 _MATRIX, _COMPRESSED, _STRUCT, _COMPLEX = 14, 15, 2, 0x800
@@ -63,35 +64,63 @@ class MatlabFile:
         for kind, content in self._elements(data[128:]):
             if kind not in (_MATRIX, _COMPRESSED):
                 raise ValueError("it is cut off or damaged, since a variable is none")
-            packed = kind == _COMPRESSED  # the name and the dims need far less than 4096 bytes
-            start = zlib.decompressobj().decompress(content[:4096], 4096)[8:] if packed else content
-            self._variables[self._matrix(memoryview(start)).name] = kind, content
+            self._variables[self._matrix(self._start(kind, content)).name] = kind, content
         self.names = list(self._variables)
 
-    def load(self, name: str) -> np.ndarray:
-        """Load an array.
+    def find(self, name: str) -> tuple[np.ndarray, Callable[[], np.ndarray]]:
+        """Find an array, without its numbers if it is a variable of its own.
 
         Args:
             name: Names of a variable and of fields of structures, with '/' between them, and
                 elements of arrays of structures as in MATLAB, such as `data(2)/fp`.
 
         Returns:
-            The array, with the dims that it has in MATLAB.
+            An array of its type and shape without content, and the function that loads the array,
+            with the dims that it has in MATLAB.
 
         Raises:
             KeyError: If there is no such array.
-            ValueError: If it does not hold numbers, or the file is damaged.
+            ValueError: If it does not hold numbers, or the file is damaged; the function, too.
         """
         (first, index), *fields = (_PLACE.fullmatch(part).groups() for part in name.split("/"))  # pyright: ignore[reportOptionalMemberAccess]
         kind, content = self._variables[first]
-        try:
-            held = self._matrix(memoryview(zlib.decompress(content)[8:]) if kind == _COMPRESSED else content)
-        except zlib.error as error:
-            raise ValueError(f"a compressed variable is damaged ({error})") from None
+        held = self._matrix(self._whole(kind, content) if fields else self._start(kind, content))
         for field, next_index in fields:
             held, index = self._field(held, first, index, field), next_index
             first = f"{first}/{field}"
-        return self._numbers(held, name)
+        if held.flags & 0xFF not in _CLASSES:
+            raise ValueError(
+                f"{name} must be an array of numbers, not a text, cell, structure, object or sparse matrix"
+            )
+        dtype = np.dtype(_CLASSES[held.flags & 0xFF])
+        header = np.broadcast_to(np.empty((), complex_type(dtype) if held.flags & _COMPLEX else dtype), held.shape)
+        return header, lambda: self._numbers(held if fields else self._matrix(self._whole(kind, content)), name)
+
+    def _start(self, kind: int, content: memoryview) -> memoryview:
+        """Content of a variable, or the first 4096 bytes of a compressed one: its name and dims
+        need far less.
+        """
+        if kind != _COMPRESSED:
+            return content
+        return memoryview(zlib.decompressobj().decompress(content[:4096], 4096))[8:]
+
+    def _whole(self, kind: int, content: memoryview) -> memoryview:
+        """Content of a variable. The size that a compressed one states is checked before."""
+        if kind != _COMPRESSED:
+            return content
+        head, unpacking = self._matrix(self._start(kind, content)), zlib.decompressobj()
+        size = 8 + int(np.frombuffer(zlib.decompressobj().decompress(content[:4096], 8), f"{self._order}u4")[1])
+        # 16 bytes hold any number, and 4096 what precedes them
+        if head.flags & 0xFF in _CLASSES and size > 4096 + 16 * math.prod(head.shape):
+            raise ValueError(f"{head.name} is damaged, since {size} bytes are not those of its shape {head.shape}")
+        refuse_beyond_memory(head.name, (size,), np.dtype("u1"))
+        try:
+            data = unpacking.decompress(content, size + 1)
+        except zlib.error as error:
+            raise ValueError(f"a compressed variable is damaged ({error})") from None
+        if len(data) != size or not unpacking.eof:
+            raise ValueError(f"{head.name} is damaged, since its compressed numbers do not have its size")
+        return memoryview(data)[8:]
 
     def _matrix(self, data: memoryview) -> _Matrix:
         """Parse the content of an element as an array."""
@@ -128,10 +157,6 @@ class MatlabFile:
     def _numbers(self, held: _Matrix, name: str) -> np.ndarray:
         """Parse the numbers of an array."""
         kind, parts = held.flags & 0xFF, []
-        if kind not in _CLASSES:
-            raise ValueError(
-                f"{name} must be an array of numbers, not a text, cell, structure, object or sparse matrix"
-            )
         for _ in range(2 if held.flags & _COMPLEX else 1):
             stored, data = next(held.elements, (0, b""))
             if stored not in _STORED or len(data) != math.prod(held.shape) * int(_STORED[stored][1]):

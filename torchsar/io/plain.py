@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from torchsar.core import ArrayFile
+from torchsar.core.stored import refuse_beyond_memory
 from torchsar.io.containers import open_container
 from torchsar.io.extras import library, reading
 from torchsar.io.fields import refuse_absent
@@ -76,6 +77,7 @@ def read_array(file: str | Path, key: str | None = None) -> np.ndarray:
             pillow = library("PIL.Image", "study", f"reading {path}")
             with reading(path, "an array or a picture"):
                 picture = stack.enter_context(pillow.open(path))
+                refuse_beyond_memory(str(path), picture.size[::-1], np.dtype(np.float64))
                 grey = picture if len(picture.getbands()) == 1 and picture.mode != "P" else picture.convert("L")
                 return np.asarray(grey, np.float64)[::-1].copy()
         if held.kind == "table" and key is None:

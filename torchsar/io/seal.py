@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,46 @@ def checksum(arrays: Mapping[str, np.ndarray], about: Any = None) -> str:
         content = np.where(np.isnan(x), np.asarray(np.nan, x.dtype), x) if x.dtype.kind in "fc" else x
         found.update(f"{name} {x.dtype.str} {x.shape} ".encode())
         found.update(np.ascontiguousarray(content).tobytes())
+    return found.hexdigest()
+
+
+def plain_files(path: Path) -> list[Path]:
+    """List all files below a folder.
+
+    Args:
+        path: The folder.
+
+    Returns:
+        The files, sorted.
+
+    Raises:
+        ValueError: If anything but plain files and folders is there, such as a link or a pipe.
+    """
+    found = sorted(path.rglob("*"))
+    for one in found:
+        if one.is_symlink() or not (one.is_dir() or one.is_file()):
+            raise ValueError(f"{one.relative_to(path)} is a link or no plain file")
+    return [one for one in found if one.is_file()]
+
+
+def files_checksum(path: Path, files: Iterable[Path]) -> str:
+    """Compute a checksum of the names and the contents of files.
+
+    Args:
+        path: Folder to which the names are relative.
+        files: The files.
+
+    Returns:
+        32 hexadecimal digits.
+
+    Raises:
+        OSError: If a file is missing or cannot be read.
+    """
+    found = hashlib.blake2b(digest_size=16)
+    for file in files:
+        content = file.read_bytes()
+        found.update(f"{file.relative_to(path).as_posix()} {len(content)} ".encode())
+        found.update(content)
     return found.hexdigest()
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import math
 import re
+import shutil
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
@@ -473,6 +474,12 @@ def _write(
     `turned` says that the slow dim is the second one of the array in the archive. The array is then
     stored in Fortran order.
     """
+    needed, free = math.prod(samples.shape) * samples.dtype.itemsize, shutil.disk_usage(path.parent).free
+    if needed > free:
+        raise ValueError(
+            f"{samples.what} becomes an archive of {needed / 1e9:.3g} GB, and {free / 1e9:.3g} GB are free in "
+            f"{path.parent}; make room, or choose another folder"
+        )
     with zipfile.ZipFile(path, "x") as archive:
         for name, array in arrays.items():
             with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:

@@ -14,7 +14,7 @@ import torch
 
 from torchsar.core import Axis, Recording, Signal
 from torchsar.focus.detection import QuickLook
-from torchsar.io.arrays import put
+from torchsar.io.arrays import WRITE_ALL, put, refuse_changed_files, refuse_missing_chunks, seal_files
 from torchsar.io.extras import library, reading
 from torchsar.io.fields import Level, archive, naming
 from torchsar.io.recorded import describe_stripmap
@@ -22,7 +22,9 @@ from torchsar.io.seal import canonical, group_attributes, sealed
 from torchsar.repair.placing import LinePlan
 
 # version number of the layout of the store; a store with another number is not read
-_FORMAT = 1
+_FORMAT = 2
+# folder of the samples of the image, which have checksums of their own
+_CHUNKS = "image/c"
 # number of samples of a chunk along range, by choice: a chunk is 8 MB as complex64
 _CHUNK_SAMPLES = 4096
 # number of bytes that are read from an image at once, by choice
@@ -152,13 +154,13 @@ class StripImage:
             raise FileNotFoundError(f"{path} does not exist; give the folder of the result of torchsar focus")
         zarr = library("zarr", "study", f"reading {path}")
         with reading(self.path, "an image of a strip"):
-            held = group_attributes(self.path)
+            held = refuse_changed_files(self.path)
             if held.get("format") != _FORMAT or not {"identity", "about", "blocks"} <= set(held):
                 raise ValueError(f"{path} was not written by this version of torchsar focus; choose another folder")
             self._root: Any = zarr.open_group(str(path), mode=mode)
             self.identity, self.about = held["identity"], held["about"]
             self._blocks: dict[str, list[int]] = held["blocks"]
-            self.array: Any = self._root["image"]
+            self.array: Any = self._root["image"].with_config(WRITE_ALL)
             self.axes = tuple(self._axis(name) for name in self.array.metadata.dimension_names)
 
     def _axis(self, name: str) -> Axis:
@@ -218,9 +220,10 @@ class StripImage:
             compressors=[codecs.Crc32cCodec()],  # detects a damaged chunk
             dimension_names=[axis.name for axis in axes],
             attributes={"unit": "1"},
+            config=WRITE_ALL,
         )
         plain = {"format": _FORMAT, "identity": dict(identity), "about": dict(about), "blocks": {}}
-        root.update_attributes(sealed(plain))
+        seal_files(root, Path(path), _CHUNKS, **plain)
         return StripImage(path, "r+")
 
     def refuse_another(self, identity: Mapping[str, Any]) -> None:
@@ -285,9 +288,11 @@ class StripImage:
             The lines of a part, and the part with its axes.
 
         Raises:
-            ValueError: If a chunk is damaged.
+            ValueError: If a chunk is damaged or missing.
         """
         azimuth, range_ = self.axes
+        with reading(self.path, "an image of a strip"):
+            refuse_missing_chunks(self.array)
         # number of lines with which no chunk is read twice
         whole = math.lcm(multiple, self.array.chunks[0])
         step = max(1, _PART_BYTES // (multiple * range_.n * self.array.dtype.itemsize)) * multiple

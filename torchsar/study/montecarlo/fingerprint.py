@@ -194,7 +194,7 @@ class _Reader:
 def _own(function: FunctionType) -> list[Any]:
     """Code of a function, or its name if it belongs to a library, and its defaults."""
     module = str(function.__globals__.get("__name__"))
-    code = f"{module}.{function.__code__.co_qualname}" if _is_library(module) else function.__code__
+    code = f"{module}.{function.__code__.co_qualname}" if is_library(module) else function.__code__
     return [code, function.__defaults__, function.__kwdefaults__]
 
 
@@ -204,11 +204,11 @@ def _used(function: FunctionType) -> dict[str, Any]:
     # None if the variable is not assigned
     found = {name: None if cell == CellType() else cell.cell_contents for name, cell in cells}
     scope, mentioned = function.__globals__, _names(function.__code__)
-    for name in () if _is_library(str(scope.get("__name__"))) else sorted(mentioned & set(scope)):
+    for name in () if is_library(str(scope.get("__name__"))) else sorted(mentioned & set(scope)):
         value = scope[name]
         if not isinstance(value, _NAMESPACES):
             found[name] = value
-        elif not (isinstance(value, ModuleType) and _is_library(value.__name__)):
+        elif not (isinstance(value, ModuleType) and is_library(value.__name__)):
             found |= {f"{name}.{key}": vars(value)[key] for key in mentioned & set(vars(value))}
     return found
 
@@ -233,7 +233,7 @@ def _parts_of_name(value: type | ModuleType) -> tuple[Any, ...]:
     """Name of a class or a module. For a class of the user also its bases and its members, without
     those that Python adds.
     """
-    if isinstance(value, ModuleType) or _is_library(value.__module__):
+    if isinstance(value, ModuleType) or is_library(value.__module__):
         return (getattr(value, "__module__", ""), value.__name__)
     members = {
         key: one
@@ -243,8 +243,15 @@ def _parts_of_name(value: type | ModuleType) -> tuple[Any, ...]:
     return (value.__module__, value.__name__, value.__bases__, members)
 
 
-def _is_library(module: str) -> bool:
-    """True if a module belongs to the standard library or to an installed package."""
+def is_library(module: str) -> bool:
+    """Decide whether a module belongs to the standard library or to an installed package.
+
+    Args:
+        module: Its name.
+
+    Returns:
+        The answer.
+    """
     top = module.partition(".")[0]
     file = getattr(sys.modules.get(module), "__file__", None) or ""
     installed = "site-packages" in file or "dist-packages" in file

@@ -270,7 +270,7 @@ def open_store(
         ConfigError: If a new store would replace results, or the existing one belongs to another
             sweep.
     """
-    path = folder.path / "results.zarr"
+    path = folder.store("results.zarr")
     there = path.exists() and not (folder.claimed and cut_off(path))
     if there and resume:
         return Store.resume(path, plan.grid, plan.trials, identity, allow_changed)

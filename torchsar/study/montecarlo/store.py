@@ -6,8 +6,8 @@ never fewer. Trials that are not marked are ignored and computed again.
 
 Everything that is read has a checksum. Each chunk has the checksum of zarr. The marks of the trials
 contain those of the numbers of each point, so that a missing or an older chunk is detected. They
-also contain the checksums of the saved arrays, of the metadata of all arrays, and of the
-attributes.
+also contain the checksums of the files of saved arrays, of the metadata of all arrays, and of the
+attributes. Only plain files are read.
 """
 
 from __future__ import annotations
@@ -26,7 +26,16 @@ import zarr
 from zarr.codecs import Crc32cCodec
 
 from torchsar.core.stored import machine_memory_bytes
-from torchsar.io.seal import SEAL, address, array_metadata, canonical, checksum, document, group_attributes, sealed
+from torchsar.io.seal import (
+    SEAL,
+    address,
+    array_metadata,
+    canonical,
+    files_checksum,
+    group_attributes,
+    plain_files,
+    sealed,
+)
 from torchsar.study.montecarlo.fingerprint import changes, short
 from torchsar.study.montecarlo.grid import Grid
 from torchsar.study.montecarlo.record import OUTCOME, Record, blank
@@ -34,7 +43,7 @@ from torchsar.study.montecarlo.summary import Labels
 from torchsar.study.settings.errors import ConfigError, one_line
 
 # version of the layout of the store; other versions are rejected on resume
-FORMAT = 3
+FORMAT = 4
 # largest number of trials whose saved arrays wait to be written, because they fill the memory
 # meanwhile
 _WAITING = 64
@@ -186,7 +195,7 @@ class Store:
                 group.attrs.put(about)
                 for name, data in arrays.items():
                     group.create_array(name, data=data, overwrite=True, compressors=[Crc32cCodec()])
-                self._marks[_SAVED][path] = _of_saved(self.path, path, arrays)
+                self._marks[_SAVED][path] = _of_saved(self.path, path)
             for point in {point for point, _ in self._dirty}:
                 mark = {"spans": _spans(self.record.done[point]), SEAL: self.record.checksum(point)}
                 self._marks["points"][",".join(map(str, point))] = mark
@@ -307,6 +316,7 @@ def _opened(path: Path, mode: Any, needed: Collection[str] = ("labels", "identit
     if not (path / "zarr.json").is_file():
         raise ConfigError(f"{path} holds no results of a sweep; choose another folder")
     with _undamaged(path):
+        plain_files(path)
         root, held = zarr.open_group(str(path), mode=mode), group_attributes(path, {"format": FORMAT})
     if needed and (held.get("format") != FORMAT or not set(needed) <= set(held)):
         raise ConfigError(
@@ -364,8 +374,7 @@ def _loaded(root: zarr.Group, path: Path) -> Record:
             if name in coordinates and list(array[: known[0]]) != list(whole[name][: known[0]]):
                 raise ValueError(f"the coordinate {name!r} does not hold its values")
         for place, known in marks[_SAVED].items():
-            group: Any = root[f"{_SAVED}/{place}"]
-            if _of_saved(path, place, {name: array[...] for name, array in group.arrays()}) != known:
+            if _of_saved(path, place) != known:
                 raise ValueError(f"the saved arrays {place} differ from their checksum")
         return record
 
@@ -402,11 +411,11 @@ def _coordinates(record: Record) -> dict[str, Sequence[Any]]:
     return {**record.labels, "trial": range(record.trials), **named}
 
 
-def _of_saved(path: Path, place: str, arrays: Mapping[str, np.ndarray]) -> str:
-    """Checksum of the saved arrays of a trial and of the metadata of their groups."""
+def _of_saved(path: Path, place: str) -> str:
+    """Checksum of all files of the saved arrays of a trial, and of those of the groups above."""
     folder = path / _SAVED / place
-    groups = (folder.parents[1], folder.parent, folder, *(folder / name for name in sorted(arrays)))
-    return checksum(arrays, [document(group) for group in groups])
+    above = [group / "zarr.json" for group in (folder.parents[1], folder.parent)]
+    return files_checksum(path, [*above, *plain_files(folder)])
 
 
 def _attributes(node: Any) -> dict[str, Any]:

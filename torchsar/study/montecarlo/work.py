@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
+import random
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
+from traceback import walk_tb
 from typing import Any
 
 import numpy as np
@@ -19,7 +21,7 @@ from torch.utils._pytree import tree_leaves
 
 from torchsar.core import Draws, Outcome, is_out_of_memory
 from torchsar.study.memory import PeakMemory
-from torchsar.study.montecarlo.fingerprint import code
+from torchsar.study.montecarlo.fingerprint import code, is_library
 from torchsar.study.montecarlo.grid import Case, Grid
 from torchsar.study.montecarlo.record import OK, OUTCOME
 from torchsar.study.settings.errors import ConfigError, one_line
@@ -209,7 +211,7 @@ class Work:
         Raises:
             ConfigError: If the trial function fails.
         """
-        found, waiting, parts = fits, [chunk], []
+        found, waiting, parts, before = fits, [chunk], [], _global_generators()
         with _warnings_kept() as said:
             while waiting:
                 piece = waiting.pop(0)
@@ -221,6 +223,11 @@ class Work:
                 except (Exception, SystemExit) as error:
                     self._refuse_unless_halving_helps(piece, error)
                     found, waiting = -(-len(piece) // 2), [piece, *waiting]
+        if _global_generators() != before:
+            said.append(
+                "trials draw random numbers from a global generator (torch, numpy or random), which differ with the "
+                "batches and processes, and after a resume; draw them from the draws that the trial function gets"
+            )
         return Computed(parts, found if found != fits else None, tuple(dict.fromkeys(said)))
 
     def _refuse_unless_halving_helps(self, chunk: Chunk, error: BaseException) -> None:
@@ -232,7 +239,7 @@ class Work:
         if not is_out_of_memory(error):
             raise ConfigError(
                 f"{where}: {'' if isinstance(error, ConfigError) else type(error).__name__ + ': '}"
-                f"{one_line(error) or 'no message'}"
+                f"{one_line(error) or 'no message'}{_own_line(error)}"
             ) from error
         if len(chunk) == 1:
             raise ConfigError(
@@ -285,6 +292,21 @@ class Work:
             _numbers(bounds, n, f"{BOUNDS}."),
             {row: {name: _array(value, row, n, f"{SAVED}.{name}") for name, value in kept.items()} for row in rows},
         )
+
+
+def _own_line(error: BaseException) -> str:
+    """The innermost line of the user's code that an error passed through, as words; empty if it was
+    raised in the code of libraries alone.
+    """
+    frames = [(frame.f_globals.get("__name__"), frame, line) for frame, line in walk_tb(error.__traceback__)]
+    own = [(frame, line) for module, frame, line in frames if not is_library(str(module))]
+    return f" (line {own[-1][1]} of {own[-1][0].f_code.co_filename})" if own else ""
+
+
+def _global_generators() -> tuple[Any, ...]:
+    """States of the random generators that a process has without making one."""
+    _, numbers, *rest = np.random.get_state()
+    return torch.get_rng_state().numpy().tobytes(), np.asarray(numbers).tobytes(), rest, random.getstate()
 
 
 @contextmanager

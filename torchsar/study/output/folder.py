@@ -90,6 +90,15 @@ class ResultFolder:
         """Reserve the folder for a result of this kind."""
         self._note(kind=self.kind)
 
+    def store(self, name: str) -> Path:
+        """Return the path of a store of this folder.
+
+        Raises:
+            ConfigError: If it is a link, since writing would change files outside of the folder.
+        """
+        _refuse_links(self.path, self.path / name)
+        return self.path / name
+
     def refuse_conflicts(self, names: Sequence[str]) -> None:
         """Check that no file of the user has the name of a file of the result.
 
@@ -115,8 +124,6 @@ class ResultFolder:
     def finish(self) -> None:
         """Complete a replacement that was interrupted, and remove files of incomplete results."""
         held, new = self._manifest(), self.path / STATE / "new"
-        if new.is_symlink() or new.parent.is_symlink():
-            raise ConfigError(f"--out {self.path}: {new} is a link, not made by torchsar; choose another folder")
         if held["old"] is not None:
             files, old = held["files"], held["old"]
             for name in {*files, *old}:
@@ -174,6 +181,7 @@ class ResultFolder:
         """Replace entries of the manifest. The file is replaced as a whole."""
         path = self.path / STATE / "manifest.json"
         part = path.with_name("manifest.json.part")
+        part.unlink(missing_ok=True)  # it may be a link or a pipe
         part.write_text(json.dumps(sealed({**self._manifest(), **changes})), encoding="utf-8")
         part.replace(path)
 
@@ -231,6 +239,7 @@ def _locked(out: Path) -> Any:
     the process ends.
     """
     state = out / STATE
+    _refuse_links(out, state, *(state / name for name in ("lock", "new", "manifest.json")))
     for attempts_left in reversed(range(10_000)):
         try:
             state.mkdir(parents=True, exist_ok=True)
@@ -254,6 +263,12 @@ def _locked(out: Path) -> Any:
                 f"--out {out}: another torchsar command is writing there; wait for its end, or choose another folder"
             ) from None
         file.close()
+
+
+def _refuse_links(out: Path, *paths: Path) -> None:
+    for path in paths:
+        if path.is_symlink():
+            raise ConfigError(f"--out {out}: {path} is a link, not made by torchsar; choose another folder")
 
 
 def _rank(name: str) -> tuple[int, str]:
