@@ -26,8 +26,9 @@ class Case:
     grid: ImageGrid
     history: Tensor
 
-    def plan(self, error_db: float = -70.0) -> TilePlan:
-        return TilePlan(self.frequency_hz, self.transmitter_m, self.receiver_m, self.reference_m, self.grid, error_db)
+    def plan(self, error_db: float = -70.0, images: float | None = None) -> TilePlan:
+        given = self.frequency_hz, self.transmitter_m, self.receiver_m, self.reference_m, self.grid, error_db
+        return TilePlan(*given, images=images)
 
     def direct(self, pixels_m: Tensor) -> Tensor:
         """The sum over all samples at pixels (pixel, 3), by its definition."""

@@ -45,7 +45,8 @@ def test_a_ladar_without_an_image_has_no_such_comparison(tmp_path: Path) -> None
     assert all(choice.name != "image beside the direct sum" for choice in choices_of(bench))
 
 
-def test_omega_k_stands_beside_tiles_where_a_method_uses_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize("beam", [None, {"width_deg": 0.5}])
+def test_omega_k_stands_beside_tiles_where_a_method_uses_it(tmp_path: Path, beam: dict | None) -> None:
     strip = {
         "stage": "omega_k_image",
         "azimuth_m": 10.0,
@@ -62,7 +63,7 @@ def test_omega_k_stands_beside_tiles_where_a_method_uses_it(tmp_path: Path) -> N
         "nominal": {"kind": "straight_path", "start_m": [-1500.0, -10.0, 1500.0], "velocity_m_s": [0.0, 5.0, 0.0]},
         "x": {"sway": {"kind": "sinusoid", "amplitude_m": 0.2, "frequency_hz": 0.3}},
     }
-    scene = world("path", pulses=400, transmitter=track, navigation=None)
+    scene = world("path", pulses=400, transmitter=track, navigation=None, beam=beam)
     bench = bench_of(tmp_path, "path", processor=methods, world=scene, metrics={})
     (choice,) = choices_of(bench)
     assert choice.measured is not None
@@ -70,7 +71,8 @@ def test_omega_k_stands_beside_tiles_where_a_method_uses_it(tmp_path: Path) -> N
     one = next(one for one in choice.alternatives if one.name == "omega-K after motion compensation of order 2")
     assert one.loss is not None
     loss = measured.loss(one, measured.run(one))["image_error_db"]
-    assert abs(loss - one.loss["image_error_db"]) < 3.5 and loss < -20
+    # the narrower antenna sees less of the change of motion errors with the angle
+    assert abs(loss - one.loss["image_error_db"]) < 3.5 and loss < (-38 if beam else -20)
     # tiles sum the pulses of the same beam
     tiles = next(one for one in choice.alternatives if one.name == "tiles at -40 dB")
     assert tiles.loss is not None

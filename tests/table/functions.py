@@ -207,7 +207,7 @@ def tile_plan(n_pulse: int, n: int) -> focus.TilePlan:
     place = torch.stack([x, torch.full_like(x, -900.0), torch.full_like(x, 500.0)], -1)
     grid = focus.ImageGrid(torch.zeros(3), torch.eye(3)[:2], (5, 4), 0.5)
     frequency_hz = 9.3e9 + 4e6 * torch.arange(n, dtype=F64)
-    return focus.TilePlan(frequency_hz, place, None, 2 * torch.linalg.vector_norm(place, dim=-1), grid)
+    return focus.TilePlan(frequency_hz, place, None, 2 * torch.linalg.vector_norm(place, dim=-1), grid, images=None)
 
 
 def compensated(x: Tensor) -> Tensor:

@@ -19,7 +19,7 @@ from torchsar.focus.motion_compensation import compensated_image
 from torchsar.focus.processed_beam import ProcessedBeam
 from torchsar.focus.requirements import Limit
 from torchsar.focus.spotlight import window_weights
-from torchsar.focus.tiles import TilePlan
+from torchsar.focus.tiles import image_tiles
 from torchsar.focus.tiles.scene import Lit, Weight
 from torchsar.radar import StraightTrack
 from torchsar.radar.antenna_path import AntennaPath
@@ -452,7 +452,7 @@ class TileImage(PathImage):
         """
         places = antennas.transmitter_m, antennas.receiver_m, antennas.reference_m
         beam = self.lit(antennas), self.weight(antennas)
-        return TilePlan(frequency_hz, *places, grid, self.error_db, *beam).image(history)
+        return image_tiles(history, frequency_hz, *places, grid, self.error_db, *beam)
 
 
 class DirectImage(PathImage):

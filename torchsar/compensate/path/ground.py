@@ -187,4 +187,4 @@ def ground_image(
     corner = middle - spacing * sum(n // 2 * axis for n, axis in zip(counts, axes, strict=True))
     grid = ImageGrid(corner, axes, (counts[0], counts[1]), spacing)
     places = antennas.transmitter_m, antennas.receiver_m, antennas.reference_m
-    return TileOperator(TilePlan(frequency_hz, *places, grid, ERROR_DB))
+    return TileOperator(TilePlan(frequency_hz, *places, grid, ERROR_DB, images=None))

@@ -308,7 +308,7 @@ class Strip:
         lit = partial(self.beam.lit_pulses, antennas.places[-1])
         places = antennas.transmitter_m, antennas.receiver_m, antennas.reference_m
         weight = partial(self.beam.pulse_weights, antennas.places[-1])
-        plan = TilePlan(self.frequency_hz, *places, self.grid, ERROR_DB, lit, weight)
+        plan = TilePlan(self.frequency_hz, *places, self.grid, ERROR_DB, lit, weight, images=None)
         image = plan.image(self.history * self.weights.to(self.history.real.dtype))
         found = prominent_places(image, self.grid, self.cells, 300)
         if len(found) < assessment.LEAST_SCATTERERS:

@@ -22,9 +22,21 @@ from torchsar.focus.tiles.scene import Sampled, Scene, some_of
 # Number of pulses in one product of the spreading, by choice. Products of fewer pulses are slow,
 # those of more have more zeros.
 CHUNK = 64
+# Number of pairs of tile and trial whose pixels are formed at once, by choice. It is large enough
+# for efficient matrix products, and small enough to limit the memory of each thread and of
+# gradients.
+GROUP = 16
 # number of sub-apertures above which each one is assessed, because the errors of a rough path
 # differ between them
 _FEW_PARTS = 3
+
+
+class Unsuitable(ValueError):
+    """Tiles do not reach the error in a geometry."""
+
+
+class Costly(Unsuitable):
+    """Tiles cost more than the direct sum."""
 
 
 @dataclass(frozen=True)
@@ -74,28 +86,37 @@ def error_db(scene: Scene, choice: Choice) -> float:
     return 20 * math.log10(math.hypot(error, choice.sampling_error))
 
 
-def choose(scene: Scene, error_db: float) -> Choice:
+def choose(scene: Scene, error_db: float, images: float | None) -> Choice:
     """Choose the cheapest sizes whose predicted error is at most `error_db`.
 
     Args:
         scene: Geometry.
-        error_db: Wanted error relative to the image of white noise in dB.
+        error_db: Wanted error relative to the image of white noise in dB, -130 to -20.
+        images: Number of images over which the plan and its tables are shared; None for so many
+            that neither the plan nor the direct sum counts.
 
     Returns:
         The sizes.
 
     Raises:
-        ValueError: If none meets the error, or it is not offered.
+        Costly: If images by the direct sum take less time.
+        Unsuitable: If no sizes meet the error.
     """
-    # the kernels reach -130 dB, and the expansion to second order is not suitable for more than -20
-    # dB
-    if not -130 <= error_db <= -20:
-        raise ValueError(f"error_db of an image by tiles must be -130 to -20 dB, got {error_db:g} dB")
-    wanted, best = 10 ** (error_db / 20), math.inf
+    wanted, best, direct_s = 10 ** (error_db / 20), math.inf, direct_seconds(scene)
+    # seconds of planning on one core, measured: those of any plan, and those of each attempt
+    plan_s, attempt_s = 0.06, 0.012
+    images, most_s = (math.inf, math.inf) if images is None else (images, direct_s)
     failed: list[tuple[tuple[int, int, int, int], float]] = []
-    for sizes in _sizes(scene, error_db):
+    # nothing is planned for images that take less time than any plan
+    offered = _sizes(scene, error_db, images) if most_s > plan_s / images else []
+    least_s, attempts = offered[0][0] if offered else plan_s / images, 0
+    for seconds, sizes in offered:
+        least_s = seconds + (plan_s + attempts * attempt_s) / images
+        if least_s > most_s:
+            break
         if any(_hopeless(sizes, *other, wanted) for other in failed):
             continue
+        attempts += 1
         sampled = scene.sampled(*sizes)
         if sampled.error < wanted and sizes[2] > _FEW_PARTS:
             sampled = scene.sampled(*sizes, dense=True)
@@ -116,12 +137,32 @@ def choose(scene: Scene, error_db: float) -> Choice:
                 reached = 20 * math.log10(math.hypot(sampled.error, sampling))
                 return Choice(*sizes, numbers, taps, *slope, reached, sampling)
         failed.append((sizes, sampled.error))
+    if least_s > most_s:
+        raise Costly(
+            f"the direct sum takes about {direct_s / least_s:.2g} of the time of tiles, with their share of a plan for "
+            f"images={images:g}"
+        )
     reach = f"{20 * math.log10(best):.1f} dB" if best < 1 else "no error below 0 dB"
-    raise ValueError(
+    raise Unsuitable(
         f"tiles reach {reach} in this geometry, wanted were {error_db:g} dB; admit more, such as "
         f"error_db={error_db + 20:g}, take a finer spacing of the pixels, turn the axes of the grid to the direction "
-        "of the range, or use the direct sum"
+        f"of the range, or sum directly, which takes about {direct_s:.2g} s for these pulses"
     )
+
+
+def direct_seconds(scene: Scene) -> float:
+    """Estimate the time of an image by the direct sum on one core.
+
+    Args:
+        scene: Geometry.
+
+    Returns:
+        Time in seconds.
+    """
+    *_, lit = scene.probed
+    pulses = float((lit[..., 1] - lit[..., 0]).clamp_min(0).double().mean())
+    # measured per pulse and pixel, for one antenna and for two
+    return pulses * math.prod(scene.grid.counts) * (120e-9, 180e-9)[len(scene.places) - 1]
 
 
 def _points(scene: Scene, width: int, depth: int, wanted: float) -> list[tuple[int, float]]:
@@ -169,14 +210,15 @@ def _hopeless(sizes: tuple[int, int, int, int], other: tuple[int, int, int, int]
     return sizes[3] == other[3] and not error * 10 ** (-24 * gain / 20) <= wanted
 
 
-def _sizes(scene: Scene, error_db: float) -> list[tuple[int, int, int, int]]:
-    """Sizes (width, depth, parts, order) of tiles, ordered by the estimated computing time of the
-    image.
+def _sizes(scene: Scene, error_db: float, images: float) -> list[tuple[float, tuple[int, int, int, int]]]:
+    """Estimated computing time of an image in s and sizes (width, depth, parts, order) of tiles,
+    ordered by the time.
 
     The time follows from the slopes of the path at pixels that most pulses light. The kernel and
     the window are those for half of the error, which is usual. The factors in ns were fitted to the
     times of 13 plans on one core. They apply per sample of a window or of its spectrum, per flop of
-    a product, per element of the expansion, and per tile.
+    a product, per element of the expansion, and per tile. Small images take more, because of the
+    calls of each group of tiles, and the first image computes the tables.
     """
     grid, (low, _, high) = scene.grid, scene.waves
     usual, per_metre, share = (
@@ -212,5 +254,7 @@ def _sizes(scene: Scene, error_db: float) -> list[tuple[int, int, int, int]]:
             flops += 8 * parts * tiles * length * width * (MOMENTS * nodes * across + (order + 1) * depth) * along
             time = tiles * pulses * (samples + length) * 4.4 + flops * 0.0142
             time += parts * tiles * (length * width * MOMENTS * (order + 1) * 2.1 + 3000)
-            found.append((time, (width, depth, parts, order)))
-    return [sizes for _, sizes in sorted(found)]
+            calls = parts * math.ceil(tiles / GROUP) * across * along
+            image_s, tables_s = 2e-9 * time + 1.5e-3 * calls, 3e-9 * time + 5e-3 * calls
+            found.append((image_s + tables_s / images, (width, depth, parts, order)))
+    return sorted(found)

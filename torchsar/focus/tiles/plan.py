@@ -13,12 +13,13 @@ import torch
 from torch import Tensor
 
 from torchsar.core import checked_samples, is_hidden, is_traced, untraced
-from torchsar.focus.backprojection import direct_sum, expanded_history
+from torchsar.focus.backprojection import expanded_history
 from torchsar.focus.image_grid import ImageGrid
 from torchsar.focus.tiles.choice import Choice
+from torchsar.focus.tiles.direct import Direct, weighted_sum
 from torchsar.focus.tiles.expansion import slopes
-from torchsar.focus.tiles.scene import Lit, Weight, pulse_weights
-from torchsar.focus.tiles.sector import Sector
+from torchsar.focus.tiles.scene import Lit, Weight
+from torchsar.focus.tiles.sector import Sector, planned
 from torchsar.radar.antenna_path import AntennaPath, refuse_unusable
 from torchsar.radar.spotlight import frequency_step_hz
 
@@ -43,8 +44,9 @@ class TilePlan:
     tiles and the pulses into sub-apertures. Within a tile the path of each pulse is that of a plane
     wave, so that the polar-format algorithm applies, plus small terms that are expanded
     (`expansion`). Any path and spacing of the pulses is admitted. The sizes are chosen so that the
-    predicted error is at most `error_db`; `choice` has them. The geometry is computed once, for any
-    number of histories of complex64 or complex128.
+    predicted error is at most `error_db`; `choice` has them. Where no sizes are suitable, or the
+    direct sum costs less, the pulses are summed directly; `direct` says so. The geometry is
+    computed once, for any number of histories of complex64 or complex128.
 
     Leading dimensions of the positions are trials with paths of their own. Their mean is the
     nominal path, from which they may differ as motion errors do. The image is differentiable in
@@ -68,13 +70,20 @@ class TilePlan:
             finite, float64 (point, pulse), such as those of a beam with smooth edges. Within a tile
             they are interpolated, as exactly as wanted; the faster they change, the longer an image
             takes, longest with the hard edges of `lit` alone. None for equal ones.
+        images: Number of images for which the plan is made. Where the direct sum takes less time
+            for them than plan and tiles, or tiles do not reach the error, pulses are summed
+            directly; `direct` says so. None for tiles in any case.
 
     Raises:
         TypeError: If frequencies or positions are not float64.
         ValueError: If shapes do not match, values are not finite, the frequencies do not rise in
             equal steps, `lit` or `weight` returns other shapes, no pulse lights any of 64 x 64
-            pixels that are spread over the image, tiles do not reach the error in this geometry, or
-            the geometry is not constant in a program that is traced, as by `torch.export`.
+            pixels that are spread over the image, `error_db` is not -130 to -20 dB, `images` is
+            None and tiles do not reach the error, or the geometry is not constant in a program that
+            is traced, as by `torch.export`.
+
+    Warns:
+        UserWarning: If pulses are summed directly because tiles do not reach the error.
     """
 
     def __init__(
@@ -87,9 +96,17 @@ class TilePlan:
         error_db: float = -70.0,
         lit: Lit | None = None,
         weight: Weight | None = None,
+        images: float | None = 1.0,
     ) -> None:
         self.frequency_hz, self.grid, self.error_db = frequency_hz, grid, float(error_db)
-        self.lit, self.weight = lit, weight
+        self.lit, self.weight, self._images = lit, weight, images
+        # the kernels reach -130 dB, and the expansion to second order is not suitable for more than
+        # -20 dB
+        if not (-130 <= error_db <= -20 and (images is None or images > 0)):
+            raise ValueError(
+                f"error_db of an image by tiles must be -130 to -20 dB, and images positive or None, got {error_db:g} "
+                f"dB and {images} images"
+            )
         _refuse_traced(frequency_hz, transmitter_m, receiver_m, reference_m, grid.origin_m, grid.axes, grid.height_m)
         with untraced():
             refuse_unusable(frequency_hz=frequency_hz)
@@ -99,27 +116,49 @@ class TilePlan:
             if lit is None:
                 with torch.no_grad():
                     ends = sector_bounds([place.detach().mean(0) for place in places], grid)
-            self.bounds = list(itertools.pairwise(ends))
-            self.sectors = [
-                Sector(
-                    frequency_hz,
-                    [place[:, first:last] for place in places],
-                    reference_m[:, first:last],
-                    grid,
-                    self.error_db,
-                    lit,
-                    None if weight is None else partial(_weights_between, weight, first, last),
-                    1 / len(self.bounds),
-                )
-                for first, last in self.bounds
-            ]
+            bounds, found = list(itertools.pairwise(ends)), []
+            for first, last in bounds:
+                given = [place[:, first:last] for place in places], reference_m[:, first:last], grid, self.error_db, lit
+                some = None if weight is None else partial(_weights_between, weight, first, last)
+                found.append(planned(frequency_hz, *given, some, 1 / len(bounds), images))
+        self.bounds: list[tuple[int, int]] = []
+        self.sectors: list[Sector | Direct] = []
+        for one, (first, last) in zip(found, bounds, strict=True):
+            if isinstance(one, Direct) and self.sectors and isinstance(self.sectors[-1], Direct):
+                # adjacent pulses that are summed directly need their weights once
+                first, _ = self.bounds.pop()
+                self.sectors.pop()
+                some = None if weight is None else partial(_weights_between, weight, first, last)
+                one = one.of([place[:, first:last] for place in places], reference_m[:, first:last], some)
+            self.bounds.append((first, last))
+            self.sectors.append(one)
 
     @property
-    def choice(self) -> Choice:
+    def choice(self) -> Choice | None:
         """Sizes of the tiles. If there are several sectors, they are those with the largest
-        predicted error.
+        predicted error; None if all pulses are summed directly.
         """
-        return max((sector.choice for sector in self.sectors), key=lambda choice: choice.error_db)
+        choices = [sector.choice for sector in self.sectors if isinstance(sector, Sector)]
+        return max(choices, key=lambda choice: choice.error_db, default=None)
+
+    @property
+    def direct(self) -> str:
+        """How many pulses are summed directly, and why, in a sentence; empty if none are."""
+        found = [
+            (last - first, sector.why)
+            for sector, (first, last) in zip(self.sectors, self.bounds, strict=True)
+            if isinstance(sector, Direct)
+        ]
+        if not found:
+            return ""
+        return f"{sum(n for n, _ in found)} of {self.antennas.pulses} pulses are summed directly: {found[0][1]}"
+
+    def __repr__(self) -> str:
+        size = " x ".join(map(str, self.grid.counts))
+        found = [f"{size} pixels at {self.error_db:g} dB, {self.antennas.pulses} pulses in {len(self.sectors)} sectors"]
+        if self.choice is not None:
+            found.append(f"tiles of {self.choice.width} x {self.choice.depth} pixels")
+        return f"TilePlan({'; '.join([*found, *([self.direct] if self.direct else [])])})"
 
     def _set_path(
         self, transmitter_m: Tensor, receiver_m: Tensor | None, reference_m: Tensor
@@ -146,8 +185,8 @@ class TilePlan:
 
         Raises:
             TypeError: If the positions are not float64.
-            ValueError: If shapes do not match, values are not finite, or tiles do not reach the
-                error for this path.
+            ValueError: If shapes do not match, values are not finite, or tiles of a plan for tiles
+                in any case do not reach the error for this path.
         """
         _refuse_traced(transmitter_m, receiver_m, reference_m)
         plan = copy.copy(self)
@@ -155,7 +194,8 @@ class TilePlan:
             places, reference_m = plan._set_path(transmitter_m, receiver_m, reference_m)
             if plan.antennas.pulses != self.antennas.pulses or len(places) != len(self.antennas.places):
                 given = transmitter_m, receiver_m, plan.antennas.reference_m
-                return TilePlan(self.frequency_hz, *given, self.grid, self.error_db, self.lit, self.weight)
+                other = self.grid, self.error_db, self.lit, self.weight, self._images
+                return TilePlan(self.frequency_hz, *given, *other)
             plan.sectors = [
                 sector.moved([place[:, first:last] for place in places], reference_m[:, first:last])
                 for sector, (first, last) in zip(self.sectors, self.bounds, strict=True)
@@ -215,15 +255,7 @@ class TilePlan:
         at = ((pixels_m - grid.origin_m) @ grid.axes.mT / grid.step_m).round().long()
         if bool(((at < 0) | (at >= at.new_tensor(grid.counts))).any()):
             raise ValueError("pixels_m must be positions of pixels of the grid of the plan, got some outside of it")
-        weights = None
-        if self.lit is not None or self.weight is not None:
-            weights = pulse_weights(pixels_m, self.antennas.pulses, self.lit, self.weight).mT
-
-        def path(pulses: slice, some: slice) -> tuple[Tensor, Tensor | None]:
-            weight = None if weights is None else weights[pulses, some]
-            return self.antennas.path_m(pixels_m[some], pulses), weight
-
-        return direct_sum(history, self.frequency_hz, path, len(pixels_m), eps=eps)
+        return weighted_sum(history, self.frequency_hz, self.antennas, pixels_m, self.lit, self.weight, eps)
 
 
 def sector_bounds(places: Sequence[Tensor], grid: ImageGrid, most_rad: float = math.radians(45)) -> list[int]:
@@ -311,6 +343,8 @@ def image_tiles(
         TypeError: If the history is not complex, or frequencies or positions are not float64.
         ValueError: If shapes do not match, values are not finite, the frequencies do not rise in
             equal steps, `lit` or `weight` returns other shapes, no pulse lights any of 64 x 64
-            pixels that are spread over the image, or tiles do not reach the error in this geometry.
+            pixels that are spread over the image, or `error_db` is not -130 to -20 dB.
     """
-    return TilePlan(frequency_hz, transmitter_m, receiver_m, reference_m, grid, error_db, lit, weight).image(history)
+    images = max(1.0, history.shape[:-2].numel() / max(1, reference_m.shape[:-1].numel()))
+    plan = TilePlan(frequency_hz, transmitter_m, receiver_m, reference_m, grid, error_db, lit, weight, images)
+    return plan.image(history)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -15,7 +16,8 @@ from torch.utils.checkpoint import checkpoint
 
 from torchsar.core import block_bytes_of, is_plain, over_blocks, untraced
 from torchsar.focus.image_grid import ImageGrid
-from torchsar.focus.tiles.choice import choose, error_db
+from torchsar.focus.tiles.choice import GROUP, Costly, Unsuitable, choose, error_db
+from torchsar.focus.tiles.direct import Direct
 from torchsar.focus.tiles.expansion import slopes
 from torchsar.focus.tiles.part import Band, Part, Tables
 from torchsar.focus.tiles.scene import Lit, Scene, Weight, part_bounds, tile_centres, tile_heights
@@ -24,10 +26,6 @@ from torchsar.radar.stripmap import LIGHT_M_S
 # Largest size of the tables of the pulses, and of the weights of the tiles (384 MB each), that are
 # kept for the next image, by choice. A small machine has that much memory to spare.
 _KEPT_BYTES = 3 << 27
-# Number of pairs of tile and trial whose pixels are formed at once, by choice. It is large enough
-# for efficient matrix products, and small enough to limit the memory of each thread and of
-# gradients.
-_GROUP = 16
 # bytes of profiles that are formed at once, by choice, which limits the memory of the padded
 # spectra
 _PROFILE_BYTES = 1 << 25
@@ -77,9 +75,11 @@ class Sector:
         lit: Pulses that light each point, see `TilePlan`; None for all.
         weight: Weights of the pulses, see `TilePlan`; None for equal ones.
         kept: Share of the memory that tables and weights may take, 0 to 1.
+        images: Number of images that share the plan, see `TilePlan`.
 
     Raises:
-        ValueError: If tiles do not reach the error in this geometry.
+        Costly: If tiles take longer than the direct sum.
+        Unsuitable: If tiles do not reach the error in this geometry.
     """
 
     def __init__(
@@ -92,8 +92,9 @@ class Sector:
         lit: Lit | None = None,
         weight: Weight | None = None,
         kept: float = 1.0,
+        images: float | None = None,
     ) -> None:
-        self.frequency_hz, self.grid, self.error_db = frequency_hz, grid, error_db
+        self.frequency_hz, self.grid, self.error_db, self._images = frequency_hz, grid, error_db, images
         self.lit, self.weight, self._share = lit, weight, kept
         self._places, self._reference_m = places, reference_m
         with torch.no_grad():
@@ -108,6 +109,8 @@ class Sector:
         # middle
         middle = scene.spread[1, 1][None]
         first, last = scene.lit_pulses(middle)[0].tolist()
+        if scene.weighted:
+            scene.weights(middle)  # raises ValueError for weights of another shape or type
         _, a, b = slopes([v[first : max(last, first + 1)] for v in nominal], middle, grid.axes)
         self._swapped = float(a.abs().mean()) > float(b.abs().mean())
         if self._swapped:
@@ -116,7 +119,7 @@ class Sector:
         self._scene = scene
         # the tables of the choice are on the host, independently of the default device
         with torch.device("cpu"):
-            self.choice = choice = choose(scene, self.error_db)
+            self.choice = choice = choose(scene, self.error_db, self._images)
         self._size = size = choice.width, choice.depth
         self._band = Band.of(self.frequency_hz, LIGHT_M_S, choice.oversampling)
         self._tiles = tuple(-(-n // m) for n, m in zip(grid.counts, size, strict=True))
@@ -135,7 +138,7 @@ class Sector:
         self._tables = _Kept(len(every[0]) * self._table_count, self._share)
         self._weights = _Kept(sum(part.weight_count for part in parts), self._share)
 
-    def moved(self, places: Sequence[Tensor], reference_m: Tensor) -> Sector:
+    def moved(self, places: Sequence[Tensor], reference_m: Tensor) -> Sector | Direct:
         """Return the sums of a path that differs little; a new plan where it differs too much.
 
         Args:
@@ -152,7 +155,8 @@ class Sector:
             if predicted <= self.error_db + 2:
                 moved.choice = replace(self.choice, error_db=predicted)
             else:
-                moved._plan(every)
+                given = self.frequency_hz, places, reference_m, self.grid, self.error_db, self.lit, self.weight
+                return planned(*given, self._share, self._images)
         return moved
 
     def _error_db(self, places: Sequence[Tensor]) -> float:
@@ -180,7 +184,7 @@ class Sector:
         """Form all tiles, (tile, path * trial, x, y), of data (path, pulse, trial, frequency)."""
         profiles = self._profiles(data)
         paths, _, trials, _ = data.shape
-        step = max(1, _GROUP // (paths * trials))
+        step = max(1, GROUP // (paths * trials))
         for kept in (self._tables, self._weights):
             kept.begin(data.dtype, step)
         with untraced():
@@ -194,7 +198,7 @@ class Sector:
         # If only the history requires gradients, the autograd graph holds only the tables and
         # weights, which are kept in any case, and the window indices. Otherwise the pixels are
         # computed again in the backward pass.
-        linear = trials <= _GROUP and not any(v.requires_grad for v in given[1:])
+        linear = trials <= GROUP and not any(v.requires_grad for v in given[1:])
         linear = linear and self._tables.fits(data.dtype) and self._weights.fits(data.dtype)
         linear = linear or not all(map(is_plain, given))  # torch.func takes no checkpoints
         pixels = self._pixels if linear else partial(checkpoint, self._pixels, use_reentrant=False)
@@ -288,3 +292,44 @@ class Sector:
         if fixed:
             self._tables.keep(key, tables, dtype)
         return tables
+
+
+def planned(
+    frequency_hz: Tensor,
+    places: Sequence[Tensor],
+    reference_m: Tensor,
+    grid: ImageGrid,
+    error_db: float,
+    lit: Lit | None,
+    weight: Weight | None,
+    kept: float,
+    images: float | None,
+) -> Sector | Direct:
+    """Return the sums of the pulses of a path by tiles, or without them where these do not suit.
+
+    Args:
+        frequency_hz: Frequencies in Hz, rising in equal steps, float64 (frequency,).
+        places: Positions of one or two antennas, each float64 (path, pulse, 3).
+        reference_m: Path to which the phases refer in metres, float64 (path, pulse).
+        grid: Pixels.
+        error_db: Largest error relative to the image of white noise, in dB.
+        lit: Pulses that light each point, see `TilePlan`; None for all.
+        weight: Weights of the pulses, see `TilePlan`; None for equal ones.
+        kept: Share of the memory that tables and weights may take, 0 to 1.
+        images: Number of images that share the plan; None for tiles in any case.
+
+    Returns:
+        The sums.
+
+    Raises:
+        Unsuitable: If `images` is None and tiles do not reach the error in this geometry.
+    """
+    given = frequency_hz, places, reference_m, grid, error_db, lit, weight
+    try:
+        return Sector(*given, kept, images)
+    except Unsuitable as why:
+        if images is None:
+            raise
+        if not isinstance(why, Costly):
+            warnings.warn(f"{places[0].shape[1]} pulses are summed directly: {why}", stacklevel=4)
+        return Direct(*given, str(why))

@@ -21,6 +21,7 @@ from torchsar.echo.path import flown_paths, nominal_geometry
 from torchsar.focus import MotionCompensation, OmegaKImage, PathImage, ProcessedBeam, TilePlan, backproject
 from torchsar.focus.path_image import last_image, possible_plans, seen_in
 from torchsar.focus.requirements import Limit, Requirement
+from torchsar.focus.spotlight import window_weights
 from torchsar.io import read_history
 from torchsar.metrics import (
     contrast,
@@ -40,7 +41,7 @@ from torchsar.study.output.report import Drawn, first_named
 from torchsar.study.systems.isal import estimated_phase, received
 from torchsar.study.trials.batch import IMAGE, Batch, Judged, Metrics, Processed, Result, Trials
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.choice import Alternative, Choice, Measured, some_pixels, white_noise
+from torchsar.study.trials.choice import Alternative, Choice, Measured, lit_noise, some_pixels, white_noise
 from torchsar.study.trials.system import Column, Noise, System, World, by_limit
 
 
@@ -318,8 +319,8 @@ class AnyPath(System):
         "contrast": "standard deviation over mean of the intensity |I|^2",
         "image_error_db": "10 lg of |g I - I0|^2 / |I0|^2 in dB, I0 from the reference method, after the shift, "
         "rotation and stretch, the linear and small quadratic phase over the image and the complex gain g that fit "
-        "best, which autofocus cannot observe; in `trade`: of the image of white noise, without registration, "
-        "relative to the direct sum over the same pulses",
+        "best, which autofocus cannot observe; in `trade`: of the windowed image of white noise seen through the "
+        "antenna, without registration, relative to the direct sum over the same pulses",
         "path_residual_rms_m": "rms over the pulses of half the path over the middle of the scene, recorded and "
         "corrected minus true, without constant and linear terms; modulo half a wavelength where the path or phases of "
         "pulses are corrected; for a strip over the middle of the strip abeam, and over the pulses that see the image",
@@ -445,7 +446,9 @@ class AnyPath(System):
         geometry = (clean.aux["frequency_hz"], antennas.transmitter_m, antennas.receiver_m, antennas.reference_m)
         # the tile plans sum the same pulses as the recommended method
         seen = stage.lit(antennas), stage.weight(antennas)
-        tiles = possible_plans(lambda error: TilePlan(*geometry, grid, error, *seen), (-20.0, -40.0, -60.0, -80.0))
+        tiles = possible_plans(
+            lambda error: TilePlan(*geometry, grid, error, *seen, images=None), (-20.0, -40.0, -60.0, -80.0)
+        )
         alternatives = [
             Alternative(
                 f"tiles at {error:g} dB",
@@ -472,7 +475,7 @@ class AnyPath(System):
             for order, one in straight.items()
         ]
         every = [*compensated, *alternatives, Alternative("direct sum", {"stage": "direct_image"}, {})]
-        measured = partial(_measured, bench, geometry, {**straight, **tiles}, stage)
+        measured = partial(_measured, bench, geometry, {**straight, **tiles}, stage, lit)
         return [Choice("image", "stage", every, measured)]
 
 
@@ -546,10 +549,15 @@ def _measured(
     geometry: tuple[Tensor, Tensor, Tensor | None, Tensor],
     plans: Mapping[float, MotionCompensation | TilePlan],
     stage: PathImage,
+    beam: SideBeam | None,
 ) -> Measured:
     """Measure images of white noise at random pixels, relative to the direct sum."""
     draws, every = bench.draws(), stage.grid.pixels_m().reshape(-1, 3)
     noise = white_noise(draws, geometry[1].shape[-2], len(geometry[0]))
+    if beam is not None:
+        noise = lit_noise(noise, geometry[0], AntennaPath(*geometry[1:]), beam)
+    rows, columns = (window_weights(name, n) for name, n in zip(stage.windows, noise.shape, strict=True))
+    noise = noise * columns * rows[:, None]
     some = some_pixels(draws, len(every))
     pixels = every[some]
     whole = backproject(noise, *geometry, pixels)

@@ -25,10 +25,12 @@ from torchsar.radar import (
     AntennaPath,
     BistaticRadar,
     InverseRadar,
+    StraightTrack,
     StripmapRadar,
     TriangularLadar,
     frequency_samples,
 )
+from torchsar.scene import SideBeam
 from torchsar.study.settings.errors import ConfigError, one_line
 from torchsar.study.settings.sections import Config, Loaded
 from torchsar.study.settings.signature import AUTO
@@ -254,6 +256,35 @@ def white_noise(draws: Draws, pulses: int, samples: int) -> Tensor:
         Noise, complex128 (pulse, sample).
     """
     return draws.normal("trade.noise", (pulses, samples), torch.complex128)
+
+
+def lit_noise(noise: Tensor, frequency_hz: Tensor, antennas: AntennaPath, beam: SideBeam) -> Tensor:
+    """Give white noise the spectrum of scatterers in all directions, seen through an antenna.
+
+    Args:
+        noise: White noise, complex128 (pulse, frequency).
+        frequency_hz: Frequencies in Hz, float64 (frequency,).
+        antennas: Path of the antennas, about straight; the receiver has the beam.
+        beam: Beam of the antenna; of several trials the mean.
+
+    Returns:
+        Phase history, complex128 (pulse, frequency).
+    """
+    place, reference = (
+        x.reshape(-1, *x.shape[-n:])[0] for x, n in ((antennas.places[-1], 2), (antennas.reference_m, 1))
+    )
+    sine = torch.linspace(-1, 1, 8193, dtype=torch.float64)
+    power = beam.mean_power(sine).reshape(-1, len(sine)).mean(0)
+    # cycles per pulse of the echo of a scatterer ahead, and all directions with the same echo
+    ahead = (2 if antennas.receiver_m is None else 1) * StraightTrack.fitted(place).step_m * frequency_hz / LIGHT_M_S
+    most = math.ceil(float(ahead.max()) + 0.5)
+    cycles = torch.fft.fftfreq(len(noise), dtype=torch.float64)
+    held = torch.zeros(noise.shape, dtype=torch.float64)
+    for alias in range(-most, most + 1):
+        at = (cycles[:, None] + alias) / ahead
+        held += power[((at.clamp(-1, 1) + 1) / 2 * (len(sine) - 1)).round().long()] * (at.abs() <= 1)
+    lit = torch.fft.ifft(torch.fft.fft(noise, dim=0) * held.sqrt(), dim=0)
+    return lit * unit_phasor(reference[:, None] * (frequency_hz / LIGHT_M_S), noise.dtype)
 
 
 @dataclass(frozen=True, eq=False)
