@@ -16,12 +16,14 @@ import torch
 import yaml
 
 from tests.program import Program
+from tests.repair import test_placing as placing
 from tests.study.tiny import TINY
 from torchsar.cli import main
 from torchsar.compensate import EnergyCentre
 from torchsar.core import Outcome
 from torchsar.focus import Detect, FocusStrip, QuickLook
 from torchsar.io import StripImage, read_images, read_stripmap
+from torchsar.metrics import impulse_response
 from torchsar.study.memory import PeakMemory
 from torchsar.study.table import load
 from torchsar.study.trials.bench import Bench
@@ -278,3 +280,18 @@ def test_the_memory_is_that_of_a_block(tmp_path: Path, monkeypatch: pytest.Monke
         # the recording and its image have 59 MB each, the arrays of a block 5.8 MB; what the
         # process keeps besides varies by megabytes with what ran in it before
         assert peak.bytes < 32e6
+
+
+@pytest.mark.slow
+def test_lost_lines_are_filled_before_focusing(tmp_path: Path) -> None:
+    number, peaks = np.delete(np.arange(placing.LINES), slice(250, 310)), []
+    for kept in (np.arange(placing.LINES), number):
+        path = placing.archived(
+            tmp_path / f"{len(kept)}.npz", placing.echoes(kept / placing.PRF, 0.0), placing.PRF, line_number=kept
+        )
+        out = path.with_suffix("")
+        assert main(["focus", "long_strip", f"data.file={path}", "--out", str(out)]) == 0
+        (image,) = read_images(out / "image.zarr").values()
+        found = [impulse_response(image, at, search_m=8.0)["peak"] for at in placing.TARGETS]
+        peaks.append(torch.stack(found).abs().log10() * 20)
+    assert float((peaks[1] - peaks[0]).abs().max()) < 0.5  # up to 1.8 dB without the stage

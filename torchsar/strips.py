@@ -17,6 +17,7 @@ from torchsar.focus import Detect, FocusStrip, QuickLook
 from torchsar.focus.strip import StripPlan, focus_block
 from torchsar.io import StripImage, write_strip_geotiff
 from torchsar.io.strip import StripRecording, samples_checksum
+from torchsar.repair import SparseFill
 from torchsar.study.output.folder import ResultFolder, fresh_result, opened
 from torchsar.study.output.progress import progress
 from torchsar.study.settings.errors import ConfigError
@@ -27,7 +28,10 @@ log = logging.getLogger("torchsar")
 # largest number of image lines in a chunk of the store
 _CHUNK_LINES = 256
 FILES = ("config.yaml", "quick_look.png")
-_HINT = "a chain for long strips has estimators, one stage focus_strip, then detect and quick_look, or neither"
+_HINT = (
+    "a chain for long strips has estimators, sparse_fill if lost lines are to be filled, one stage focus_strip, then "
+    "detect and quick_look, or neither"
+)
 
 
 def focus_recording(loaded: Loaded, out: Path, resume: bool = False, device: str = "cpu") -> Path:
@@ -108,6 +112,7 @@ class _Strip:
             raise ConfigError(f"{where}: there are {len(strips)} stages focus_strip; {_HINT}")
         self._name, self._before, self._chain = strips[0], names[: names.index(strips[0])], chain
         self.focus: Any = chain.stages[strips[0]]
+        self._fill = next((name for name in self._before if isinstance(chain.stages[name], SparseFill)), "")
         after = [chain.stages[name] for name in names[len(self._before) + 1 :]]
         if [type(stage) for stage in after] not in ([], [Detect], [QuickLook], [Detect, QuickLook]):
             raise ConfigError(f"{where}: the stages {names[len(self._before) + 1 :]} follow {strips[0]}; {_HINT}")
@@ -141,14 +146,15 @@ class _Strip:
         done = [] if image is None else [keep for _, keep in plan.blocks if image.is_finished(self._rows(image, keep))]
         with progress(plan.n_lines, "lines", sum(keep.stop - keep.start for keep in done)) as count:
             for read, keep in plan.blocks:
-                raw = self.recording.recording(read.start, read.stop).signal.data
+                recorded = self.recording.recording(read.start, read.stop)
+                raw = recorded.signal.data
                 checksum = samples_checksum(raw)
                 if image is not None and keep in done:
                     image.check(self._rows(image, keep), checksum)
                     continue
                 if image is not None and keep.stop - keep.start < self._looks:
                     break  # too few lines are left for a look
-                block = self._block(raw, read, keep, values)
+                block = self._block(raw, recorded.aux["missing"], read, keep, values)
                 if image is None:  # the size of the image is known after the first block
                     about = {"values": known, "rows": [block.axes[0].n, keep.stop]}
                     axes, dtype = self._axes(block, plan, keep), block.data.dtype
@@ -173,11 +179,18 @@ class _Strip:
         return slice(keep.start * rows // lines, keep.stop * rows // lines)
 
     @torch.no_grad()
-    def _block(self, raw: Tensor, read: slice, keep: slice, values: Mapping[str, Tensor]) -> Signal:
-        """Focus a block of raw lines, and detect it if the chain has a stage for this."""
+    def _block(self, raw: Tensor, missing: Tensor, read: slice, keep: slice, values: Mapping[str, Tensor]) -> Signal:
+        """Focus a block of raw lines, after its missing lines were filled if the chain has a stage
+        for this, and detect it if there is one.
+        """
         given = {name: value.to(self._device) for name, value in values.items()}
-        focus, radar = self.focus.focuser, self.recording.radar
-        image = focus_block(raw.to(self._device), focus, radar, self.recording.axes, read, keep, given)
+        fill = self._chain.stages[self._fill] if self._fill and bool(missing.any()) else None
+
+        def focused(signal: Signal, **given: Tensor) -> Signal:
+            whole = signal if fill is None else fill(signal, missing=missing.to(self._device), **given)
+            return self.focus.focuser(whole, **given)
+
+        image = focus_block(raw.to(self._device), focused, self.recording.radar, self.recording.axes, read, keep, given)
         return image if self.detect is None else self.detect(image)
 
     def _plan(self, values: Mapping[str, Tensor]) -> StripPlan:
@@ -200,7 +213,8 @@ class _Strip:
         log.info("estimates from lines %d to %d", first, first + count - 1)
         with torch.no_grad():
             trace = self._chain.trace(part)
-        changed = [name for name in self._before if trace.outputs[name] is not trace.inputs[name]]
+        kept = [name for name in self._before if name != self._fill]
+        changed = [name for name in kept if trace.outputs[name] is not trace.inputs[name]]
         if changed:
             raise ConfigError(f"the stage {changed[0]!r} before {self._name} changes the samples; {_HINT}")
         for name, estimate in trace.estimates.items():

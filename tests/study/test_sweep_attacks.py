@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import errno
 import json
-import random
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -413,7 +412,7 @@ def test_an_error_names_the_line_of_the_function(tmp_path: Path) -> None:
         sweep(fails, {"a": [1.0]}, trials=2)
 
 
-@pytest.mark.parametrize("drawn", [torch.rand, np.random.rand, lambda n: [random.random() for _ in range(n)]])
+@pytest.mark.parametrize("drawn", [torch.rand, np.random.rand])
 def test_numbers_of_a_global_generator_are_warned_of(drawn: Any, caplog: pytest.LogCaptureFixture) -> None:
     def trial(parameters: Any, draws: Any) -> Any:
         return {"error_m": torch.as_tensor(drawn(len(draws.trials))), "other_m": draws.normal("x", ())}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import random
 import signal
+import socket
 import threading
 import time
 from collections import Counter
@@ -286,6 +287,9 @@ def test_the_workers_of_this_machine_take_work_from_nobody_else() -> None:
     with engine(workers=1) as ours:
         address = ours.client.scheduler.address
         assert address.startswith("tls://127.0.0.1")
+        web = ours.client.cluster.scheduler.services["dashboard"].port
+        with pytest.raises(OSError):
+            socket.create_connection(("127.0.0.1", web), timeout=2)
         with pytest.raises((OSError, TypeError)):
             Client(address, timeout=2)
         with pytest.raises(OSError):

@@ -79,17 +79,20 @@ class StripRecording:
             last: Index after the last line.
 
         Returns:
-            Recording of these lines, with their slow times and side data.
+            Recording of these lines, with their slow times and side data, and with `missing`
+            (line,), bool.
 
         Raises:
             ValueError: If a sample or side data are not valid, as for `read_stripmap`.
         """
         if self._plan is None:
-            return self._recorded(first, last)
+            held = self._recorded(first, last)
+            return replace(held, aux={**held.aux, "missing": torch.zeros(last - first, dtype=torch.bool)})
         start, stop = self._plan.needed(first, last)
         held = self._recorded(start, stop)
         rows = self._plan.placed(self._plan.aligned(held.signal.data, start), start, first, last, self._turns)
         aux = {name: x for name, x in held.aux.items() if name not in _PER_LINE}
+        aux["missing"] = self._plan.missing[first:last]
         if "line_number" in held.aux:
             aux["line_number"] = torch.arange(first, last)
         pulse = self.axes[0].part(first, last)

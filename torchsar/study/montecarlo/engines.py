@@ -89,6 +89,8 @@ def _plugin(work: Work, threads: int, own: bool) -> Any:
             )  # a failed trial is reported only once, as one sentence
             torch.set_num_threads(threads)
             keep_freed_memory()
+            if own:
+                worker.http_server.stop()
             if own and threading.current_thread() is threading.main_thread():
                 signal.signal(signal.SIGINT, signal.SIG_IGN)
             self.work, self.programs = _on_own_gpu(work, worker.name), code(work.programs["code"])
@@ -213,7 +215,8 @@ def _local(distributed: Any, workers: int, threads: int) -> Iterator[Engine]:
         )
         | {"OMP_WAIT_POLICY": "PASSIVE"},
         "distributed.scheduler.allowed-failures": _DEATHS,
-        # dask always starts its web servers; without routes they serve no pages
+        # dask always starts its web servers, which are stopped then; without routes they serve no
+        # pages meanwhile
         "distributed.scheduler.http.routes": [],
         "distributed.worker.http.routes": [],
     }
@@ -228,6 +231,7 @@ def _local(distributed: Any, workers: int, threads: int) -> Iterator[Engine]:
                 f"the worker processes did not start ({one_line(error)}); a script that starts workers is imported "
                 "again by each of them: put its call of sweep(...) below the line: if __name__ == '__main__':"
             ) from None
+        cluster.loop.add_callback(cluster.scheduler.http_server.stop)
         with cluster, distributed.Client(cluster) as client:
             yield Distributed(client, workers, threads, own=True)
 

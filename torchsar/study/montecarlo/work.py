@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import random
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -225,7 +224,7 @@ class Work:
                     found, waiting = -(-len(piece) // 2), [piece, *waiting]
         if _global_generators() != before:
             said.append(
-                "trials draw random numbers from a global generator (torch, numpy or random), which differ with the "
+                "trials draw random numbers from a global generator of torch or numpy, which differ with the "
                 "batches and processes, and after a resume; draw them from the draws that the trial function gets"
             )
         return Computed(parts, found if found != fits else None, tuple(dict.fromkeys(said)))
@@ -304,9 +303,11 @@ def _own_line(error: BaseException) -> str:
 
 
 def _global_generators() -> tuple[Any, ...]:
-    """States of the random generators that a process has without making one."""
+    """States of the global generators of torch and numpy. That of random is left out, since threads
+    of dask use it.
+    """
     _, numbers, *rest = np.random.get_state()
-    return torch.get_rng_state().numpy().tobytes(), np.asarray(numbers).tobytes(), rest, random.getstate()
+    return torch.get_rng_state().numpy().tobytes(), np.asarray(numbers).tobytes(), rest
 
 
 @contextmanager
