@@ -374,6 +374,21 @@ def test_a_wide_search_with_an_unknown_dwell_takes_few_images() -> None:
     torch.testing.assert_close(found["velocity_m_s"], torch.full_like(doppler, 121.5), atol=0.2, rtol=0)
 
 
+@pytest.mark.parametrize("points, snr_db", [(3, None), (12, 5.0)])
+def test_an_unknown_dwell_does_not_change_the_velocity_or_its_deviation(points: int, snr_db: float | None) -> None:
+    """The echo fills a twelfth of the PRF; the minimum is 150 times as wide as with all of it."""
+    fine = replace(AIRCRAFT, prf_hz=900.0)
+    world = StripmapWorld(RandomPoints(points, 80.0, 100.0), Dwell(1.0), velocity_m_s=121.5, snr_db=snr_db)
+    signal = simulate(fine, world, 1800, 128, Draws(17, trials=range(4)))[0].signal
+    known, unknown = (
+        EffectiveVelocity(OmegaK(replace(fine, integration_s=dwell_s)), 20.0)(signal) for dwell_s in (1.0, None)
+    )
+    assert bool(known.ok.all()) and bool(unknown.ok.all())
+    assert float((unknown["velocity_m_s"] - 121.5).abs().max()) < 0.15
+    ratio = unknown.std["velocity_m_s"] / known.std["velocity_m_s"]
+    assert float(ratio.min()) > 0.5 and float(ratio.max()) < 2
+
+
 @pytest.mark.parametrize("kind", [PhaseIncrement, EnergyCentre, DopplerCentroid])
 def test_outcomes_of_centroids_and_values_without_assessment(kind, monkeypatch: pytest.MonkeyPatch) -> None:
     signal, _ = aircraft(RandomPoints(24, 230.0, 150.0, spread_db=6.0), trials=1)

@@ -183,16 +183,19 @@ def minimum_entropy_velocity(
         value, _ = parabola_minimum(objective, value, near, tolerance)
     value, _ = settle(value, nominal)
     value = implicit(lambda x, *data: objective(x[..., 0]), value[..., None], group, doppler_hz)[..., 0]
-    half = min(step, nominal / 2) / 10
+    half = torch.full_like(value.detach(), min(step, nominal / 2) / 10)
+    if group.radar.integration_s is None:
+        with torch.no_grad():
+            half = _scale_m_s(objective, value.detach(), 2 * min(step, nominal / 18), nominal * 4 / 9) / 20
     parts = [_parts(spectrum, doppler_hz, weight, value + side * half) for side in (-1, 0, 1)]
     rows, (low, middle, high), shares = zip(*parts, strict=True)
-    curvature = (low - 2 * middle + high).sum((-2, -1)) / half**2
+    curvature = (low - 2 * middle + high).sum((-2, -1)) / half.square()
     # energy that moves from one part to another, which does not change the entropy by itself,
     # is left out
     level = middle.sum(-1, keepdim=True) / shares[1].sum(-1, keepdim=True).clamp_min(1e-300)
-    slope = (high - low - level * (shares[2] - shares[0])) / (2 * half)
+    slope = (high - low - level * (shares[2] - shares[0])) / (2 * half[..., None, None])
     # the step leads to the vertex of the parabola, and at most to its ends
-    value = value - quotient(slope.sum((-2, -1)), curvature).clamp(-half, half)
+    value = value - torch.minimum(torch.maximum(quotient(slope.sum((-2, -1)), curvature), -half), half)
     points = nominal + torch.linspace(-reach, reach, costs.shape[-1], dtype=torch.float64, device=start.device)
     found = Estimate({"velocity_m_s": value}, info={"grid_velocity_m_s": points, "grid_entropy": costs})
     if not assess:
@@ -200,6 +203,33 @@ def minimum_entropy_velocity(
     with torch.no_grad():
         minimum = objective, weight, inside, step
         return velocity_assess.assessed(found, spectrum.group, image, minimum, rows, half, slope, curvature)
+
+
+def _scale_m_s(
+    objective: Callable[[Tensor], Tensor], velocity_m_s: Tensor, least_m_s: float, most_m_s: float
+) -> Tensor:
+    """Distance from a minimum (...,) in m/s that exceeds its half width, up to four times.
+
+    Distances grow by factors of four. Within the width the entropy grows with the square of the
+    distance, by sixteen from one to the next, and beyond it with the logarithm. The result is the
+    largest distance at which it is more than four times that of the next smaller one. Going from
+    large to small ones, the entropy of noise, whose minima are as narrow as the least distance, is
+    met only where there is no wider minimum.
+
+    Args:
+        objective: Entropy (...,) for a velocity (...,).
+        velocity_m_s: The velocity of the minimum.
+        least_m_s: Least distance.
+        most_m_s: Largest distance, greater than the least one.
+    """
+    levels = int(math.log(most_m_s / least_m_s, 4)) + 1
+    distances = [least_m_s * 4.0**k for k in range(levels)]
+    least = objective(velocity_m_s)
+    rise = [(objective(velocity_m_s - d) + objective(velocity_m_s + d)) / 2 - least for d in distances]
+    found = torch.full_like(velocity_m_s, least_m_s)
+    for below, above, distance in zip(rise, rise[1:], distances[1:], strict=False):
+        found = torch.where(above > 4 * below, distance, found)
+    return found
 
 
 def _search(

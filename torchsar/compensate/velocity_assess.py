@@ -22,7 +22,7 @@ def assessed(
     nominal: Tensor,
     minimum: tuple[Callable[[Tensor], Tensor], Tensor, Tensor, float],
     rows: Sequence[Tensor],
-    half_m_s: float,
+    half_m_s: Tensor,
     slope: Tensor,
     curvature: Tensor,
 ) -> Estimate:
@@ -41,8 +41,9 @@ def assessed(
         minimum: Entropy of the image as a function of the velocity (...,); weights of the blocks,
             (..., block); whether the best velocity of the first grid is not at an end, (...,); and
             the step of the grid, see `grid_step_m_s`.
-        rows: Range-Doppler spectra of images a tenth of a step below, near and above the velocity.
-        half_m_s: That tenth of a step.
+        rows: Range-Doppler spectra of images a little below, at and above the velocity.
+        half_m_s: Distance of the outer ones, (...,): a tenth of the step or, where the dwell of the
+            beam is not known, a twentieth of a distance that exceeds the width of the minimum.
         slope: Slopes of the summands of the entropy over the velocity, (..., block, part).
         curvature: Curvature of the entropy, (...,).
 
@@ -54,7 +55,7 @@ def assessed(
     def entropy(rows: Tensor) -> Tensor:
         return (block_entropy(fft_lines(rows, inverse=True)) * weight).sum(-1)
 
-    def measured(distance: float) -> tuple[Tensor, Tensor]:
+    def measured(distance: Tensor) -> tuple[Tensor, Tensor]:
         sides = [objective(found["velocity_m_s"] + side * distance) for side in (-1, 1)]
         beside = 0.5 * (sides[0] + sides[1]) - entropy(rows[1])
         return beside, quotient(2 * beside.clamp_min(0), curvature).sqrt()
@@ -62,7 +63,8 @@ def assessed(
     # Depth of the minimum in nats, and its width, that of a parabola of this depth and curvature.
     # The depth is measured two steps of the grid away, or eight if the minimum is that wide,
     # because the targets are illuminated for a short time.
-    near = 2.0 * min(step, radar.velocity_m_s / 18)
+    known = radar.integration_s
+    near = 20 * half_m_s if known is None else torch.full_like(half_m_s, 2 * min(step, radar.velocity_m_s / 18))
     depth, width = measured(near)
     wide = width > near / 2
     if host_value(wide.any(), True):
@@ -73,10 +75,9 @@ def assessed(
     # grid as the width, measured at time-bandwidth products of 19 to 374.
     rest = (0.45 * width.square()).clamp_min(0.11 * step**2) / radar.velocity_m_s
     sets = [torch.stack([entropy(one[..., k::4, :]) for k in range(4)], -1) for one in rows]
-    bend = (sets[0] - 2 * sets[1] + sets[2]).mean(-1) / half_m_s**2
-    by_combs = quotient(((sets[2] - sets[0]) / (2 * half_m_s)).std(-1) / 2, bend)
+    bend = (sets[0] - 2 * sets[1] + sets[2]).mean(-1) / half_m_s.square()
+    by_combs = quotient(((sets[2] - sets[0]) / (2 * half_m_s[..., None])).std(-1) / 2, bend)
     std = torch.hypot(torch.maximum(by_parts, by_combs), rest).clamp_max(1e6)
-    known = radar.integration_s
     # velocity error of an eighth of a cycle of phase at the ends of the aperture
     most = 0.27 * width if known is None else torch.full_like(width, step / 8)
     short = known is not None and group.data.shape[-2] < known * radar.prf_hz
