@@ -778,6 +778,17 @@ def _on_signal(name: str, kind: str, build: Callable[[], Stage], laws: Laws = AL
     return Entry(name, kind, on(kind, lambda signal: build()(signal, **values)), laws=laws, build=build)
 
 
+SWEPT = radar.InverseRadar(3.2e9, 50e6, 400.0, pulse_s=2e-3)
+
+
+def _swept(signal: Signal) -> Signal:
+    """Corrects the motion of an antenna that flies by, within its sweeps."""
+    along = 2.0 * torch.arange(signal.axes[0].n, dtype=F64) - 20
+    place = torch.stack([torch.full_like(along, -300.0), along, torch.full_like(along, 100.0)], -1)
+    correct = compensate.CorrectSweepMotion(SWEPT, squint_deg=20.0)
+    return correct(signal, place.to(signal.data.device), 2 * place.norm(dim=-1).to(signal.data.device))
+
+
 MORE_STAGES = [
     _on_signal("AlignEnvelopes", "turntable", compensate.AlignEnvelopes, laws=RANGE_FREE),
     _on_signal("PulseGain", "turntable", compensate.PulseGain, laws=RANGE_FREE),
@@ -801,6 +812,13 @@ MORE_STAGES = [
         on("turntable", lambda s: compensate.ShiftRange()(s, ramp(s.axes[0].n))),
         laws=Laws(pulse=LINE_NUMBER, energy=1),
         build=compensate.ShiftRange,
+    ),
+    Entry(
+        "CorrectSweepMotion",
+        "turntable",
+        on("turntable", _swept),
+        laws=Laws(pulse="depends on the position of the antenna"),
+        build=lambda: compensate.CorrectSweepMotion(SWEPT, squint_deg=20.0),
     ),
     _on_signal("CompressDechirped", "dechirped", lambda: focus.CompressDechirped(DECHIRPED), laws=Laws(energy=1 / 64)),
     _on_signal("QuickLook", "image", lambda: focus.QuickLook(16), laws=Laws(linear="a modulus")),

@@ -88,6 +88,7 @@ REASONS: dict[str, str] = {
     "compensate.path_phase": "compensate.autofocus, which is in the table, through tiles; tests/compensate/"
     "test_path_autofocus.py",
     "compensate.CorrectPath": "subtracts positions",
+    "compensate.correct_sweep_motion": "the function of the stage, which is in the table",
     "compensate.PathAutofocus": "the stage of compensate.path_autofocus",
     "compensate.strip_autofocus": "needs a path; tests/compensate/test_strip_autofocus.py",
     "compensate.StripAutofocus": "the stage of compensate.strip_autofocus",

@@ -24,6 +24,7 @@ amplitude of each pulse            `pulse_gain`, then `equalise_pulses`
 errors of a recorded path          `path_autofocus`, of a strip `strip_autofocus`, then
                                    `CorrectPath`
 phase of each pulse on any path    `path_phase`
+motion within sweeps               `correct_sweep_motion`
 =================================  ==============================================================
 
 Most functions are stages of chains, too: `Autofocus` calls `autofocus`, and so on.
@@ -45,9 +46,11 @@ from torchsar.compensate.envelope import (
 )
 from torchsar.compensate.path import (
     CorrectPath,
+    CorrectSweepMotion,
     PathAutofocus,
     PathPhase,
     StripAutofocus,
+    correct_sweep_motion,
     path_autofocus,
     path_phase,
     strip_autofocus,
@@ -119,6 +122,7 @@ __all__ = [
     "CompensateMotion",
     "CorrectPath",
     "CorrectPulsePhase",
+    "CorrectSweepMotion",
     "DopplerCentroid",
     "EffectiveVelocity",
     "EnergyCentre",
@@ -153,6 +157,7 @@ __all__ = [
     "coarse_rotation",
     "compensate_motion",
     "correct_pulse_phase",
+    "correct_sweep_motion",
     "doppler_at",
     "energy_centre",
     "entropy_fixed_point",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -9,11 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import Draws, Recording, Truth, gathered_checks, per_trial, unit_phasor
+from torchsar.core import Draws, Recording, Truth, gathered_checks, per_trial, real_dtype, unit_phasor
 from torchsar.echo.recorded import Impairment, noise, recorded, with_samples
 from torchsar.echo.sums import blocks, echo_spectrum, row_bytes
 from torchsar.radar import AntennaPath, InverseRadar, StraightTrack, frequency_samples, range_profiles
-from torchsar.scene import PathWorld, Sway
+from torchsar.scene import Flight, PathWorld, Sway
 from torchsar.scene.trials import refuse_other_trials
 
 # amplitude gain above which a target counts as lit: half power on each of two ways
@@ -112,6 +113,44 @@ def _frequencies_hz(radar: InverseRadar, n: int, device: torch.device | str | No
     return radar.carrier_hz + radar.bandwidth_hz / n * number
 
 
+def _moving_echo(
+    flown: _Flown, time_s: Tensor, points: Tensor, weight: Tensor, radar: InverseRadar, n: int, dtype: torch.dtype
+) -> Tensor:
+    """Phase history (..., pulse, n) of sweeps within which the antennas move.
+
+    The sample of the frequency f is taken when it is sent. Relative to the middle of the lit points
+    its phase changes little within a sweep, so that it is interpolated between histories of
+    antennas at rest at Chebyshev points of the sweep, as many as the precision needs.
+    """
+    frequency = _frequencies_hz(radar, n, time_s.device)
+    half_s = radar.bandwidth_hz / radar.chirp_rate_hz_s / 2
+    power = weight.detach().abs().square()
+    centre = power @ points.detach() / power.sum(-1, keepdim=True).clamp_min(torch.finfo(power.dtype).tiny)
+    first, last = (flown.over(centre, time_s + at).path_m(points[..., None, :, :]) for at in (-half_s, half_s))
+    moved_m = float(((last - first).detach() * (power > 0)).abs().max())
+    phase = math.pi * float(frequency[-1]) / radar.wave_speed_m_s * moved_m  # at the ends of a sweep
+    wanted = math.log(1e-8 if dtype == torch.complex64 else 1e-14)
+    counts = (m for m in range(6, 257) if m * math.log(phase / 2 + 1e-9) - math.lgamma(m + 1) < wanted)
+    count = next(counts, None)
+    if count is None:
+        raise ValueError(
+            f"points of the scene move by {moved_m:.3g} m against each other within a sweep, by far more than pulses "
+            f"at {radar.prf_hz:g} Hz can sample; check pulse_s, the speed and the extent of the scene"
+        )
+    order = torch.arange(count, dtype=torch.float64, device=time_s.device)
+    angle = math.pi / count * (order + 0.5)
+    sent = torch.acos((frequency - radar.carrier_hz) * (2 / radar.bandwidth_hz))
+    share = (1 + order.sign()) / count
+    matrix = torch.cos(sent[:, None] * order) @ (share[:, None] * torch.cos(order[:, None] * angle))
+    total, over_m = torch.zeros((), dtype=dtype, device=time_s.device), torch.zeros_like(sent)
+    for column, at in zip(matrix.unbind(-1), (half_s * torch.cos(angle)).tolist(), strict=True):
+        antennas = flown.over(centre, time_s + at)
+        total = total + column.to(real_dtype(dtype)) * path_echo(antennas, points, weight, radar, n, dtype)
+        over_m = over_m + column * antennas.reference_m[..., None]
+    turns = frequency / radar.wave_speed_m_s * (over_m - flown.true.reference_m[..., None])
+    return total * unit_phasor(-turns, dtype)
+
+
 @gathered_checks()
 def simulate_path(
     radar: InverseRadar,
@@ -179,7 +218,11 @@ def simulate_path(
     points = torch.stack(torch.broadcast_tensors(x, y, world.ground.height_m(x, y) + above), -1)
     gain = _gain(world, flown.true, points, time_s)
     gain = gain * _within(flown.true, points, gain, radar, n_range)
-    history = path_echo(flown.true, points, amplitude[..., None, :] * gain, radar, n_range, dtype)
+    weight = amplitude[..., None, :] * gain
+    if world.fidelity is None:
+        history = path_echo(flown.true, points, weight, radar, n_range, dtype)
+    else:
+        history = _moving_echo(flown, time_s, points, weight, radar, n_range, dtype)
     std = torch.zeros((), dtype=torch.float64, device=device)
     if world.snr_db is not None:
         power = _lit_power(history, gain)
@@ -207,17 +250,19 @@ class _Flown:
     true: AntennaPath
     recorded: AntennaPath
     strip: bool
+    flights: tuple[Flight, ...]
 
     @staticmethod
     def of(world: PathWorld, draws: Draws, time_s: Tensor) -> _Flown:
         """Draw the flights and the paths that navigation records."""
         span_s = float(time_s[-1] - time_s[0])
-        true, recorded = [], []
+        drawn, true, recorded = [], [], []
         flights = (("transmitter", world.transmitter, world.navigation),)
         if world.receiver is not None:
             flights = (*flights, ("receiver", world.receiver, world.receiver_navigation))
         for name, flight, navigation in flights:
             path = flight.drawn(draws.part(name), span_s)
+            drawn.append(path)
             true.append(path.position_m(time_s))
             recorded.append(navigation.recorded_m(draws.part(name), time_s, path))
         if world.window_range_m is None:
@@ -226,7 +271,13 @@ class _Flown:
         else:
             reference = torch.full_like(time_s, 2 * world.window_range_m)
         flown, written = (AntennaPath(p[0], p[1] if len(p) > 1 else None, reference) for p in (true, recorded))
-        return _Flown(flown, written, world.beam is not None)
+        return _Flown(flown, written, world.beam is not None, tuple(drawn))
+
+    def over(self, centre_m: Tensor, time_s: Tensor) -> AntennaPath:
+        """True paths at other times; their reference is that over points (..., pulse, 3)."""
+        places = [flight.position_m(time_s) for flight in self.flights]
+        legs = [torch.linalg.vector_norm(place - centre_m, dim=-1) for place in places]
+        return AntennaPath(places[0], places[1] if len(places) > 1 else None, legs[0] + legs[-1])
 
     def truth(self) -> dict[str, Tensor]:
         """True positions and the error of the line of sight."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -61,7 +62,9 @@ def fmcw_recording(
 
     Returns:
         Recording as by `read_path`, with range profiles (pulse, range) in complex64, in which a
-        reference path of zero lies in the middle.
+        reference path of zero lies in the middle. The radar of one receiver with rising frequency
+        has the length of a sweep, with which `compensate.correct_sweep_motion` corrects its motion
+        within sweeps; all others take antennas to be at rest during a sweep.
 
     Raises:
         ValueError: If shapes do not fit, a number is not plausible, or a sample is not finite.
@@ -101,5 +104,7 @@ def fmcw_recording(
     received = None if receiver_offset_m is None else (place[:, None] + offset).flatten(0, 1)
     antennas = AntennaPath(sent.contiguous(), received, torch.zeros(len(sent), dtype=torch.float64))
     radar = history_radar(frequency, prf_hz * len(offset), 0.0)
+    if slope_hz_s > 0 and len(offset) == 1:
+        radar = replace(radar, pulse_s=n / sampling_hz)
     aux: dict[str, Any] = {"frequency_hz": frequency, **antennas.side_data()}
     return Recording.from_arrays(profiles, radar, what="beat", **aux)

@@ -17,7 +17,7 @@ moving targets, several channels  `BistaticWorld`; gain `Pattern` or `BandLimite
                                   `ExactRange` or `TaylorRange`; transmit range `OrbitTransmit` or
                                   `PolynomialTransmit`
 world seen from any path          `PathWorld` with a `Flight`, its `Navigation`, a `PlaneGround` and
-                                  a `SideBeam`
+                                  a `SideBeam`; `MotionInSweep`
 path of an antenna                `StraightPath`, `CircularPath`, `RecordedPath`; `Sway`, with
                                   `Jitter`, `RandomWalk`, `Offset` and the motions below
 point targets                     `Points`, `RandomPoints`; `PointCloud` of an array or an image;
@@ -65,7 +65,7 @@ from torchsar.scene.ladar import CalibrationFibre, LadarWorld
 from torchsar.scene.ladar_range import EverySample, LinearInSweep, OnePerPeriod, OnePerSweep, QuadraticInSweep
 from torchsar.scene.ladar_targets import LetterE, RetroAndBrokenLine
 from torchsar.scene.movers import Fleet, GroundMovers, MovingPoints, Ship
-from torchsar.scene.path import PathWorld, PlaneGround, SideBeam
+from torchsar.scene.path import MotionInSweep, PathWorld, PlaneGround, SideBeam
 from torchsar.scene.rotation import PolynomialRotation
 from torchsar.scene.satellite import Satellite
 from torchsar.scene.sea import ImageReflectivity, KSea
@@ -99,6 +99,7 @@ __all__ = [
     "LogAmplitude",
     "MeasuredTrack",
     "Motion",
+    "MotionInSweep",
     "MovingPoints",
     "Navigation",
     "Offset",

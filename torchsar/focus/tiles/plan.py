@@ -43,9 +43,10 @@ class TilePlan:
     where l_p(x) is the path from the transmitter over x to the receiver. The image is divided into
     tiles and the pulses into sub-apertures. Within a tile the path of each pulse is that of a plane
     wave, so that the polar-format algorithm applies, plus small terms that are expanded
-    (`expansion`). Any path and spacing of the pulses is admitted. The sizes are chosen so that the
-    predicted error is at most `error_db`; `choice` has them. Where no sizes are suitable, or the
-    direct sum costs less, the pulses are summed directly; `direct` says so. The geometry is
+    (`expansion`). Any path and spacing of the pulses is admitted. Antennas are at rest during a
+    pulse; `compensate.correct_sweep_motion` makes it so for long sweeps. The sizes are chosen so
+    that the predicted error is at most `error_db`; `choice` has them. Where no sizes are suitable,
+    or the direct sum costs less, the pulses are summed directly; `direct` says so. The geometry is
     computed once, for any number of histories of complex64 or complex128.
 
     Leading dimensions of the positions are trials with paths of their own. Their mean is the

@@ -387,6 +387,7 @@ FLIGHT_MOTIONS = Catalogue(
 )
 NOMINAL_PATHS = Catalogue("nominal path", "kind", (scene.StraightPath, scene.CircularPath, recorded_path))
 GROUNDS = Catalogue("ground", "kind", (scene.PlaneGround,))
+PATH_FIDELITIES = Catalogue("fidelity of sweeps", "kind", (scene.MotionInSweep,))
 START_PHASES = Catalogue("start phase", "kind", (scene.StartPhase, scene.UniformStartPhase))
 FIDELITIES = Catalogue("fidelity", "kind", (scene.PhaseOnly, dechirped))
 SWEEP_FIDELITIES = Catalogue(
@@ -462,6 +463,7 @@ WORLD = {
     "MOTIONS (path: world.transmitter, world.receiver, world.navigation)": FLIGHT_MOTIONS,
     "NOMINAL PATHS (path: world.transmitter, world.receiver)": NOMINAL_PATHS,
     "GROUNDS (path: world.ground)": GROUNDS,
+    "FIDELITIES (path: world.fidelity)": PATH_FIDELITIES,
     "LOG-AMPLITUDES (sal: world.log_amplitude)": LOG_AMPLITUDES,
     "FIDELITIES (sal: world.fidelity)": SWEEP_FIDELITIES,
     "SWEEP ERRORS (sal: world.sweep_error)": SWEEP_ERRORS,

@@ -32,28 +32,49 @@ from torchsar.metrics import (
     registered_error_db,
     residual_phase,
 )
-from torchsar.radar import LIGHT_M_S, AntennaPath, InverseRadar
-from torchsar.scene import Flight, Navigation, PathWorld, PlaneGround, Points, Scene, SideBeam, Sway, Together
+from torchsar.radar import AntennaPath, InverseRadar
+from torchsar.scene import (
+    Flight,
+    MotionInSweep,
+    Navigation,
+    PathWorld,
+    PlaneGround,
+    Points,
+    Scene,
+    SideBeam,
+    Sway,
+    Together,
+)
 from torchsar.scene.flight import NominalPath
 from torchsar.scene.path import Ground
-from torchsar.study.names.registry import GROUNDS, NOMINAL_PATHS, PATH_IMPAIRMENTS, SCENES, AntennaMotions
+from torchsar.study.names.registry import (
+    GROUNDS,
+    NOMINAL_PATHS,
+    PATH_FIDELITIES,
+    PATH_IMPAIRMENTS,
+    SCENES,
+    AntennaMotions,
+)
 from torchsar.study.output.report import Drawn, first_named
 from torchsar.study.systems.isal import estimated_phase, received
+from torchsar.study.systems.path.requirements import flight_requirements
 from torchsar.study.trials.batch import IMAGE, Batch, Judged, Metrics, Processed, Result, Trials
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Alternative, Choice, Measured, lit_noise, some_pixels, white_noise
 from torchsar.study.trials.system import Column, Noise, System, World, by_limit
 
 
-def path_radar(carrier_hz: float, bandwidth_hz: float, prf_hz: float) -> InverseRadar:
+def path_radar(carrier_hz: float, bandwidth_hz: float, prf_hz: float, pulse_s: float | None = None) -> InverseRadar:
     """Band and pulse rate of a radar whose pulses are compressed or dechirped.
 
     Args:
         carrier_hz: Middle of the band in Hz.
         bandwidth_hz: Bandwidth in Hz; a range cell is c / (2 bandwidth).
         prf_hz: Pulse repetition frequency in Hz.
+        pulse_s: Length in seconds of a sweep that is dechirped on receive and whose frequency
+            rises; null where antennas hardly move within a pulse.
     """
-    return InverseRadar(carrier_hz, bandwidth_hz, prf_hz)
+    return InverseRadar(carrier_hz, bandwidth_hz, prf_hz, pulse_s=pulse_s)
 
 
 @dataclass(frozen=True)
@@ -112,6 +133,8 @@ class Flown(World):
             scene is always lit.
         window_range_m: Constant range of the middle of the range window in metres; null to follow
             the middle of the scene.
+        fidelity: Motion within sweeps of the length `radar.pulse_s`; null for antennas at rest
+            during a pulse.
         noise: Receiver noise; the SNR is the mean over the samples of lit pulses.
         impairments: Impairments of the recording by name, in the order of their effect.
     """
@@ -126,6 +149,7 @@ class Flown(World):
     ground: Annotated[Ground, GROUNDS] = field(default_factory=PlaneGround)
     beam: SideBeam | None = None
     window_range_m: float | None = None
+    fidelity: Annotated[MotionInSweep, PATH_FIDELITIES] | None = None
     noise: Noise = field(default_factory=Noise)
     impairments: Mapping[str, Annotated[Impairment, PATH_IMPAIRMENTS]] = field(default_factory=dict)
 
@@ -143,7 +167,7 @@ class Flown(World):
         flown = [None if one is None else Flight(one.nominal, Sway(one.x, one.y, one.z)) for one in tracks]
         records = (one or Recorded() for one in (self.navigation, self.receiver_navigation))
         known = [Navigation(Sway(one.x, one.y, one.z), one.latency_s, one.step_m, one.rate_hz) for one in records]
-        effects = (self.ground, self.beam, self.window_range_m, self.noise.snr_db)
+        effects = (self.ground, self.beam, self.window_range_m, self.noise.snr_db, self.fidelity)
         return PathWorld(Together(self.scene), *flown, *known, *effects)  # pyright: ignore[reportCallIssue, reportArgumentType]
 
     def simulation(self, radar: InverseRadar, dtype: torch.dtype) -> Simulate:
@@ -477,71 +501,6 @@ class AnyPath(System):
         every = [*compensated, *alternatives, Alternative("direct sum", {"stage": "direct_image"}, {})]
         measured = partial(_measured, bench, geometry, {**straight, **tiles}, stage, lit)
         return [Choice("image", "stage", every, measured)]
-
-
-def flight_requirements(
-    radar: InverseRadar, true: AntennaPath, recorded: AntennaPath, beam: SideBeam | None
-) -> list[Requirement]:
-    """Return the errors of simplifications over a flight, seen from the origin.
-
-    They are the largest phases within an aperture, without constant and linear terms, which shift
-    the image. The aperture is the whole record, or the time in which a beam illuminates a point.
-
-    Args:
-        radar: Carrier and pulse rate.
-        true: True path; of several trials the first.
-        recorded: Path that navigation records.
-        beam: Beam of the antenna; None if the scene is always lit.
-
-    Returns:
-        Rows for a straight path, for the recorded one, for its speed, and for an antenna at rest
-        while an echo is on its way.
-    """
-    held = [path.of_trial((0,) * len(path.trials)) for path in (true, recorded)]
-    place, known = (path.places[-1].detach().cpu() for path in held)
-    time = torch.arange(len(place), dtype=torch.float64) / radar.prf_hz
-    basis = torch.stack([torch.ones_like(time), time], -1)
-    start, velocity = torch.linalg.lstsq(basis, place).solution
-    speed = float(velocity.norm())
-    heading = velocity / max(speed, 1e-12)
-    away = -(start + time.mean() * velocity)
-    away = away - (away @ heading) * heading
-    range_m = float(away.norm())
-    sight = away / max(range_m, 1e-12)
-    count = len(time)
-    if beam is not None and speed > 0:
-        width = math.radians(float(torch.as_tensor(beam.width_deg).max()))
-        count = min(count, max(8, round(2 * range_m * math.tan(width / 2) / speed * radar.prf_hz)))
-    dwell_s = count / radar.prf_hz
-
-    def left_m(distance: Tensor) -> float:
-        """Largest magnitude of a distance within an aperture, after its straight line is
-        removed.
-        """
-        parts = distance.unfold(0, count, max(1, count // 2))
-        line = basis[:count]
-        return float((parts.mT - line @ torch.linalg.lstsq(line, parts.mT).solution).abs().max())
-
-    bent, error = (left_m(x @ sight) for x in (place - basis @ torch.stack([start, velocity]), known - place))
-    distance = place.norm(dim=-1)
-    moved = left_m(torch.gradient(distance, spacing=(time,))[0] * distance / LIGHT_M_S)
-    # speed error dv for a phase of pi / 4 at the ends of the aperture, 4 pi / lambda v dv
-    # (T / 2)^2 / R
-    tolerated = radar.wavelength_m * range_m / (4 * speed * dwell_s**2) if speed > 0 else math.inf
-    off = abs(float(torch.linalg.lstsq(basis, known - place).solution[1] @ heading))
-    turn, quarter = 4 * math.pi / radar.wavelength_m, math.pi / 4
-    remedy = "autofocus (path_autofocus, strip_autofocus), which finds errors that change slowly over the aperture"
-    rows = (
-        ("a straight path", f"deviations of {bent:.3g} m from a straight line", bent, "image along the recorded path"),
-        ("the recorded path", f"errors of navigation of {error:.3g} m", error, remedy),
-        ("an antenna at rest during an echo", f"motion while an echo is on its way, {moved:.3g} m", moved, "move it"),
-    )
-    found = [
-        Requirement(name, f"{what} within {dwell_s:.3g} s", turn * x, x / radar.range_step_m, quarter, advice)
-        for name, what, x, advice in rows
-    ]
-    neglects = f"an error of {off:.3g} m/s; {tolerated:.3g} m/s leave a phase of pi / 4 at the ends of {dwell_s:.3g} s"
-    return [*found, Requirement("the recorded speed", neglects, quarter * off / tolerated, math.nan, quarter, remedy)]
 
 
 def _measured(
