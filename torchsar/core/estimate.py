@@ -96,7 +96,9 @@ _MESSAGES = {
     Outcome.PARTS_DISAGREE: (
         "parts of the data ask for different values: there are several motions, or the echo is too weak"
     ),
-    Outcome.HOMOGENEOUS: "the scene looks like homogeneous clutter: try link_phases, or scene='clutter'",
+    Outcome.HOMOGENEOUS: (
+        "with these phases the scene looks like homogeneous clutter: try link_phases, scene='clutter', or autofocus"
+    ),
     Outcome.SPARSE: "the scene looks like separate points, not like homogeneous clutter: try autofocus",
     Outcome.DISPLACED: "the range profiles are displaced from pulse to pulse: align them first (align_envelopes)",
     Outcome.MISFIT: "the data do not follow the model of the method: choose a method with fewer assumptions",
