@@ -1,9 +1,11 @@
 """An autofocus whose image weights come from a small trained network, beside the library's own.
 
     python scripts/learned_autofocus.py [--small] [--trials 12] [--out learned_autofocus]
+    [--weights learned.json]
 
 The estimator repeats one step: it forms the image, weights its cells, transforms the weighted image
-back to pulses, and takes the phase of each pulse relative to the result. It starts from SCA.
+back to pulses, and takes the phase of each pulse relative to the result. It starts from SCA. It is
+the method `learned` of `torchsar bench autofocus`, with the parameters that --weights writes.
 Therefore, a phase that is added to a pulse is added to its estimate, whatever its size, and a
 constant or linear phase over the pulses changes nothing. `entropy_fixed_point` and `autofocus`
 repeat the same step with weights that follow from a formula. Here a network of 97 parameters
@@ -37,7 +39,6 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import avg_pool2d, conv2d, pad, silu, softplus
 
 from torchsar import plot
 from torchsar.compensate import (
@@ -54,6 +55,7 @@ from torchsar.data import Simulated
 from torchsar.io import read_inverse
 from torchsar.metrics import entropy, phase_rmse
 from torchsar.metrics.bounds import pulse_phase_bound_of_scene_rad, pulse_phase_bound_rad, turntable_responses
+from torchsar.study.bench.learned import LearnedAutofocus, save_weights
 
 CONFIG = "isal_snr"
 TRAIN_SEED, TEST_SEED = 11, 12
@@ -64,87 +66,6 @@ TRAINED, TINY = (128, 64, 0.08, 0.045), (64, 40, 0.04, 0.025)
 LIBRARY = {f.__name__: f for f in (sca, pga, pga_sca, entropy_fixed_point, autofocus)}
 X = "SNR (dB)"
 Method = Callable[[Tensor], Tensor]
-
-
-class CellWeights(nn.Module):
-    """Weight of each image cell, computed from its power and that of its surroundings.
-
-    A shift of the image in Doppler shifts the weights, and a factor on the image changes nothing.
-
-    Args:
-        draws: Source of the initial parameters.
-        hidden: Number of hidden units.
-    """
-
-    def __init__(self, draws: Draws, hidden: int = 12) -> None:
-        super().__init__()
-
-        def drawn(name: str, scale: float, *shape: int) -> nn.Parameter:
-            return nn.Parameter(scale * draws.normal(name, shape, torch.float32))
-
-        self.of_cell, self.of_row = drawn("of_cell", 0.5, hidden, 3), drawn("of_row", 0.5, hidden, 3)
-        self.offset, self.out = nn.Parameter(torch.zeros(hidden)), drawn("out", 0.05, hidden)
-
-    def forward(self, power: Tensor) -> Tensor:
-        """Power (trial, range, Doppler) of an image to weights of the same shape.
-
-        The network adds a term to that of ln(1 + p / 2), a weight that lowers the entropy.
-        """
-        row = power.mean(-1, keepdim=True)
-        mean = row.mean(-2, keepdim=True).clamp_min(1e-12)
-        noise = row.quantile(0.25, -2, keepdim=True)  # if the target leaves some range cells free
-        sharpness = power.square().mean((-2, -1), keepdim=True) / mean.square()
-        cell = [power, beside(power), around(power)]
-        x = torch.stack([(part / mean + 1e-4).log() for part in cell], 1)
-        context = [(row / mean).log(), (noise / mean).log().expand_as(row), sharpness.log().expand_as(row)]
-        y = torch.stack(context, 1).clamp(-8, 8)
-        hidden = conv2d(x, self.of_cell[..., None, None], self.offset) + conv2d(y, self.of_row[..., None, None])
-        change = conv2d(silu(hidden), self.out[None, :, None, None])
-        return softplus(x[:, 0] - 0.7) * change[:, 0].exp()
-
-
-def beside(power: Tensor) -> Tensor:
-    """Mean power of a cell and its neighbours in range."""
-    return avg_pool2d(pad(power, (0, 0, 1, 1))[:, None], (3, 1), 1)[:, 0]
-
-
-def around(power: Tensor) -> Tensor:
-    """Mean power of 5 range cells and 9 Doppler cells; the image is circular in Doppler."""
-    wide = pad(pad(power, (4, 4), mode="circular"), (0, 0, 2, 2))
-    return avg_pool2d(wide[:, None], (5, 9), 1)[:, 0]
-
-
-class LearnedAutofocus(nn.Module):
-    """Phase of each pulse, (trial, pulse), from range-compressed data, (trial, pulse, range).
-
-    Args:
-        draws: Source of the initial parameters.
-    """
-
-    def __init__(self, draws: Draws) -> None:
-        super().__init__()
-        self.weights, self.relaxation = CellWeights(draws), nn.Parameter(torch.tensor(1.5))
-
-    def forward(self, data: Tensor, rounds: int = 20) -> Tensor:
-        phase = sca(data)["phase_rad"]
-        rows = unit_level(data).mT
-        for _ in range(rounds):
-            phase = phase + self.step(rows, phase)
-        return phase
-
-    def step(self, rows: Tensor, phase: Tensor) -> Tensor:
-        """Phase of each pulse relative to the weighted image.
-
-        The image has two samples per Doppler cell, so that pulses at both ends of the aperture are
-        no neighbours. Without the mean of the weights, a pulse is not compared with itself.
-        """
-        n = rows.shape[-1]
-        x = rows * cis(-phase)[:, None]
-        image = torch.fft.fft(x, 2 * n)
-        weights = self.weights(image.real.square() + image.imag.square())
-        weights = weights - weights.mean(-1, keepdim=True)
-        model = torch.fft.ifft(image * weights)[..., :n]
-        return self.relaxation * (x * model.conj()).sum(-2).angle()
 
 
 def sized(pulses: float, samples: float, length_m: float, width_m: float) -> list[str]:
@@ -329,6 +250,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--small", action="store_true", help="few steps and tests on small scenes, in seconds")
     parser.add_argument("--trials", type=int, help="test scenes at each SNR (default 12, or 3 with --small)")
+    parser.add_argument("--weights", help="file for the trained parameters, .json, as the benchmark reads them")
     parser.add_argument("--out", default="learned_autofocus", help="folder of the picture")
     options = parser.parse_args(arguments)
     steps, batch, size = (12, 4, TINY) if options.small else (240, 6, TRAINED)
@@ -342,6 +264,9 @@ def main(arguments: list[str] | None = None) -> None:
         part = losses[first : first + steps // 6]
         print(f"steps {first:3} to {first + len(part) - 1:3}: mean loss {sum(part) / len(part):.6f}")
     print(f"training: {steps} steps of {batch} scenes, {time.perf_counter() - began:.0f} s")
+
+    if options.weights:
+        save_weights(network, Path(options.weights))
 
     stage = EntropyFixedPoint(nn.Parameter(torch.tensor([5.0, 2.0])))
     few = scenes(steps * batch // 8, batch, size)

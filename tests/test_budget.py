@@ -23,8 +23,12 @@ FACES = ("core", "radar", "scene", "echo", "repair", "compensate", "multichannel
 
 
 def room(path: Path) -> str:
-    """Name of the package of a module, "top" for those that stand beside the packages."""
+    """Name of the package of a module, "top" for those that stand beside the packages; the
+    benchmarks of `study`, most of which are scenes, are a room of their own.
+    """
     parts = path.relative_to(PACKAGE).parts
+    if parts[:2] == ("study", "bench"):
+        return "bench"
     return parts[0] if len(parts) > 1 else "top"
 
 

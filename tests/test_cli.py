@@ -115,7 +115,7 @@ def child_seconds(*arguments: str) -> tuple[float, subprocess.CompletedProcess[s
         (
             [],
             2,
-            "a command is missing: choose one of run, focus, sweep, requires, trade, import, export, reproduce, list",
+            "a command is missing: choose one of run, focus, sweep, requires, trade, import, export, bench, reproduce",
         ),
         (["walk"], 2, "invalid choice: 'walk'"),
         (["requires"], 2, "arguments are required: config\n"),

@@ -35,6 +35,7 @@ SMALLER = {
     "docs/tutorials/geo_ocean.md": {"world.pulses=1440": "world.pulses=540", "world.samples=192": "world.samples=128"},
     "docs/how_to/own_stage.md": {"trials=20": "trials=4"},
     "docs/how_to/ok.md": {"range(4)": "range(1)", "batch=4": "batch=1"},
+    "docs/how_to/own_method.md": {"small=True": "small=True, trials=1"},
     "docs/tutorials/isal.md": {"trials=2": "trials=1"},
 }
 
@@ -121,7 +122,7 @@ def test_a_command_is_accepted(line: str, tmp_path: Path) -> None:
         assert all(option in text for option in rest[1:] if option.startswith("--") and option != "--help")
     elif program == "torchsar":
         options, more = parser().parse_known_args(rest)
-        if options.command in ("import", "export", "list", "config", "completion"):
+        if options.command in ("import", "export", "bench", "list", "config", "completion"):
             assert not more
         elif options.command == "reproduce":
             assert not more and (options.item is None or paper(options.paper).find(options.item))

@@ -60,7 +60,7 @@ def _imports(path: Path) -> set[str]:
 
 
 # study/ from the ground up: a floor imports itself and what stands below it
-FLOORS = ("memory", "settings", "names", "output", "montecarlo", "trials", "systems", "commands", "table")
+FLOORS = ("memory", "settings", "bench", "names", "output", "montecarlo", "trials", "systems", "commands", "table")
 # a system that builds on another one, by name
 SHARED = {"isal_rotation": {"isal"}, "geo_ocean": {"geo"}, "path": {"isal"}}
 

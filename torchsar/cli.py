@@ -28,10 +28,12 @@ _COMMANDS = {
     "requires": "show the requirements of the scene of a config on models and methods",
     "trade": "measure the time and the loss of alternative methods, relative to an exact reference",
 }
+_BENCHES = ("autofocus", "alignment", "doppler", "velocity", "radial", "rotation", "repair", "channels", "path")
 _EXCHANGE = {
     "import": "write recorded data of another format, which a sidecar describes, as a recording (.npz)",
     "export": "write the images of a finished run, or its recording, in another format",
 }
+_BENCH = "score methods, your own among them, on frozen scenes with known truth"
 _REPRODUCE = "make the figures, tables and numbers of the papers, and compare them with what was published"
 
 
@@ -102,6 +104,17 @@ def parser() -> argparse.ArgumentParser:
     one.add_argument(
         "--out", type=_place, default=Path("out") / "reproduce", metavar="DIR", help="folder of records and pictures"
     )
+    one = commands.add_parser("bench", help=_BENCH, description=_BENCH[0].upper() + _BENCH[1:] + ".")
+    one.add_argument("bench", metavar="BENCH", help=f"{', '.join(_BENCHES)}")
+    text = "a built-in method, package.module:Name, a record FILE.json, or `recorded`; all built-in methods without"
+    one.add_argument("methods", nargs="*", metavar="METHOD", help=text)
+    one.add_argument("--small", action="store_true", help="every fourth world with 6 trials, in two minutes")
+    one.add_argument("--trials", type=_positive, default=20, metavar="N", help="trials in a world (default: 20)")
+    one.add_argument(
+        "--draw", type=int, default=0, metavar="N", help="other scenes than the frozen ones, N = 1, 2, ..."
+    )
+    text = "record (.json), table (.tex, .txt) or figure (.pdf, .png, .svg); may be repeated"
+    one.add_argument("--out", type=_place, action="append", default=[], metavar="FILE", help=text)
     for name, text in _PRINTED.items():
         commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
     words = "only entries that contain all these words, such as `torchsar list stripmap prf_hz`"
@@ -170,8 +183,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
             print(f"torchsar-lab {version('torchsar-lab')}", flush=True)
             return 0
-        if options.command == "reproduce":
-            print(f"torchsar: reproduce {options.paper or 'all papers'}", file=sys.stderr, flush=True)
+        if options.command in ("reproduce", "bench"):
+            subject = options.bench if options.command == "bench" else options.paper or "all papers"
+            print(f"torchsar: {options.command} {subject}", file=sys.stderr, flush=True)
         # checked before the import of torch, which takes seconds
         elif options.command not in _PRINTED:
             subject = options.file if options.command in _EXCHANGE else options.config
@@ -217,7 +231,8 @@ def _parse(given: Sequence[str]) -> argparse.Namespace:
     if rest and (not hasattr(options, "overrides") or any(word.startswith("-") for word in rest)):
         top.error(f"unrecognized arguments: {' '.join(rest)}")
     if options.command is None and not options.version:
-        top.error(f"a command is missing: choose one of {', '.join((*_COMMANDS, *_EXCHANGE, 'reproduce', *_PRINTED))}")
+        names = (*_COMMANDS, *_EXCHANGE, "bench", "reproduce", *_PRINTED)
+        top.error(f"a command is missing: choose one of {', '.join(names)}")
     if options.command == "config" and (options.what == "show") == (options.config is None):
         top.error("`torchsar config show` needs the name of a config, and `torchsar config schema` takes none")
     if rest:
@@ -228,7 +243,7 @@ def _parse(given: Sequence[str]) -> argparse.Namespace:
 def _dispatch(options: argparse.Namespace, command: str) -> int:
     from torchsar.study.settings.text import find_config
 
-    actions = {"import": _import, "export": _export, "reproduce": _reproduce}
+    actions = {"import": _import, "export": _export, "reproduce": _reproduce, "bench": _bench}
     if options.command in actions:
         try:
             return actions[options.command](options)
@@ -354,6 +369,32 @@ def _reproduce(options: argparse.Namespace) -> int:
     if options.threads is not None:
         torch.set_num_threads(options.threads)
     print(reproduce(options.paper, options.item, options.out, options.small))
+    return 0
+
+
+def _bench(options: argparse.Namespace) -> int:
+    import torch
+
+    from torchsar.study.bench.entrant import MethodError
+    from torchsar.study.bench.records import methods_of, read, recorded, score, together
+    from torchsar.study.bench.show import save, table
+    from torchsar.study.memory import keep_freed_memory
+    from torchsar.study.output.progress import told
+
+    keep_freed_memory()
+    if options.threads is not None:
+        torch.set_num_threads(options.threads)
+    methods, files = methods_of(options.methods)
+    records = [recorded(options.bench) if file == "recorded" else read(Path(file)) for file in files]
+    if methods or not files:
+        chosen = {"trials": options.trials, "small": options.small, "draw": options.draw}
+        try:
+            records.append(score(options.bench, methods or None, **chosen, say=told("worlds")))
+        except MethodError as error:
+            raise ConfigError(str(error)) from error
+    record = together(records)
+    print(table(record))
+    save(record, options.out)
     return 0
 
 

@@ -1,5 +1,5 @@
-"""Figures and tables from the records in docs/sweeps, docs/trade, docs/benchmark, docs/requires and
-docs/reproduce.
+"""Figures and tables from the records of `torchsar bench` and in docs/sweeps, docs/trade,
+docs/benchmark, docs/requires and docs/reproduce.
 
 A page names a record, what to show of it, and its words; every number comes from the record.
 """
@@ -22,6 +22,8 @@ from sphinx.util.docutils import SphinxDirective
 
 from torchsar import plot
 from torchsar.reproduce.item import SHOWN
+from torchsar.study.bench import recorded, show
+from torchsar.study.bench.records import HERE
 from torchsar.study.trials.choice import EXACT_DB
 
 # the order of the systems in tables
@@ -378,6 +380,39 @@ class ReproducedCounts(SphinxDirective):
         return self.parse_text_to_nodes("\n".join(lines))
 
 
+class BenchTable(SphinxDirective):
+    """Scores of all recorded methods of a benchmark."""
+
+    required_arguments = 1
+
+    def run(self) -> list[nodes.Node]:
+        record = recorded(self.arguments[0])
+        self.env.note_dependency(str(HERE / "recorded" / f"{self.arguments[0]}.json"))
+        head, *rows = show.cells(record)
+        lines = [head, ["---", *["---:"] * (len(head) - 1)], *([f"`{name}`", *numbers] for name, *numbers in rows)]
+        table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+        return [*self.parse_text_to_nodes(table), *self.parse_text_to_nodes(f"{show.about(record)}.")]
+
+
+class BenchTracks(SphinxDirective):
+    """Shares of right, and of sure and wrong trials of some methods in each track."""
+
+    required_arguments = 1
+    option_spec = {"methods": directives.unchanged_required}
+
+    def run(self) -> list[nodes.Node]:
+        record = recorded(self.arguments[0])
+        self.env.note_dependency(str(HERE / "recorded" / f"{self.arguments[0]}.json"))
+        names = [name.strip() for name in self.options["methods"].split(",")]
+        lines = [f"| scenes | {' | '.join(f'`{name}`' for name in names)} |", f"| --- {'| ---: ' * len(names)}|"]
+        for track in record["methods"][names[0]]["tracks"]:
+            rows = [record["methods"][name]["tracks"][track] for name in names]
+            shares = [[row[key][0] if key in row else None for key in ("right", "sure_wrong")] for row in rows]
+            texts = [f"{'-' if right is None else f'{right:.0%}'} ({wrong:.0%})" for right, wrong in shares]
+            lines.append(f"| {track} | {' | '.join(texts)} |")
+        return self.parse_text_to_nodes("\n".join(lines))
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     """Register the directives."""
     for name, directive in {
@@ -392,6 +427,8 @@ def setup(app: Sphinx) -> dict[str, Any]:
         "reproduced-table": ReproducedTable,
         "reproduced-counts": ReproducedCounts,
         "reproduced-errors": ReproducedErrors,
+        "bench-table": BenchTable,
+        "bench-tracks": BenchTracks,
     }.items():
         app.add_directive(name, directive)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import torch
@@ -10,8 +9,10 @@ from torch import Tensor
 
 from torchsar.compensate import autofocus, entropy_fixed_point, pga, pga_sca, sca
 from torchsar.core import Draws, Estimate, unit_phasor
+from torchsar.study.bench.pulses import noisy, still, turned, white
 
 DOUBLE = torch.complex128
+__all__ = ["noisy", "still", "turned", "white"]  # and those defined here
 METHODS: dict[str, Callable[[Tensor], Estimate]] = {
     "sca": sca,
     "pga": pga,
@@ -20,46 +21,6 @@ METHODS: dict[str, Callable[[Tensor], Estimate]] = {
     "autofocus": autofocus,
 }
 EQUIVARIANT = ("sca", "pga_sca", "entropy_fixed_point", "autofocus")
-
-
-def still(
-    trials: int, n_pulse: int = 128, n_range: int = 64, per_row: int = 3, width: float = 0.5, seed: int = 3
-) -> Tensor:
-    """Make points at random positions in every range cell, without a phase error.
-
-    Args:
-        trials: Number of trials.
-        n_pulse: Number of pulses.
-        n_range: Number of range cells.
-        per_row: Points per range cell.
-        width: Share of the Doppler band that the points occupy.
-        seed: Seed of the random numbers.
-
-    Returns:
-        Pulses, shape (trial, pulse, range), complex128.
-    """
-    draws = Draws(seed, trials=range(trials))
-    shape = (n_range, per_row)
-    cycles = width * draws.uniform("cycles", shape, -0.5, 0.5)
-    amplitude = draws.normal("amplitude", shape, DOUBLE)
-    k = torch.arange(n_pulse, dtype=torch.float64)
-    return (amplitude[..., None] * unit_phasor(cycles[..., None] * k, DOUBLE)).sum(-2).mT.contiguous()
-
-
-def noisy(x: Tensor, snr_db: float, seed: int = 4) -> Tensor:
-    """Add circular noise; the SNR is the mean power of all samples over the noise variance."""
-    noise = Draws(seed, trials=range(len(x))).normal("noise", tuple(x.shape[1:]), DOUBLE)
-    return x + noise * (x.abs().square().mean((-2, -1), keepdim=True) * 10 ** (-snr_db / 10)).sqrt()
-
-
-def white(trials: int, n_pulse: int = 128, seed: int = 5) -> Tensor:
-    """Draw a uniform phase for every pulse, (trial, pulse)."""
-    return Draws(seed, trials=range(trials)).uniform("white", (n_pulse,), 0.0, 2 * math.pi)
-
-
-def turned(x: Tensor, phase_rad: Tensor) -> Tensor:
-    """Multiply pulses by exp(j phase)."""
-    return x * unit_phasor(phase_rad / (2 * math.pi), DOUBLE)[..., None].to(x.dtype)
 
 
 def doppler_image(x: Tensor, phase_rad: Tensor) -> Tensor:

@@ -7,7 +7,6 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from tests.audit import ladars, pulses, strips
 from tests.compensate.scenes import noisy, still, turned, white
 from torchsar.compensate import DopplerCentroid, MirrorProduct, PhaseIncrement, SegmentedInterference, autofocus, sca
 from torchsar.core import Draws, Outcome, Recording, Signal
@@ -15,6 +14,7 @@ from torchsar.echo import Leakage, apply_impairments
 from torchsar.echo.receiver import GroundAtRest
 from torchsar.metrics import phase_rmse
 from torchsar.repair import remove_constant, remove_tones
+from torchsar.study.bench import ladars, pulses, strips
 
 TRIALS = 6
 

@@ -9,7 +9,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.audit.pulses import aligned
 from torchsar.compensate import (
     AlignEnvelopes,
     ShiftRange,
@@ -26,6 +25,7 @@ from torchsar.focus import CompressDechirped, azimuth_transform
 from torchsar.metrics import entropy
 from torchsar.radar import LIGHT_M_S, InverseRadar
 from torchsar.scene import Aircraft, Dechirped, Polynomial, Sinusoid, TurntableWorld, UniformStartPhase
+from torchsar.study.bench.profiles import aligned
 
 DOUBLE = torch.complex128
 LADAR = InverseRadar(LIGHT_M_S / 1.55e-6, 150e9, 2000.0, 0.005, 100e-6, 20e3)

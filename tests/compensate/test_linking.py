@@ -9,13 +9,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.audit.pulses import scintillating
 from torchsar.compensate import LinkPhases, autofocus, entropy_fixed_point, link_phases, pga, sca
 from torchsar.compensate.pulse_phase.homogeneous import describe, smoothed_spectrum, sparse_gain_nats
 from torchsar.compensate.pulse_phase.likelihood import Speckle
 from torchsar.compensate.pulse_phase.linking import _grown
 from torchsar.core import Axis, DerivativeWarning, Outcome, Signal
 from torchsar.metrics.phase import phase_rmse
+from torchsar.study.bench.pulses import scintillating
 from torchsar.study.montecarlo.work import LargestTensor
 
 F64 = torch.float64

@@ -11,7 +11,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.audit.pulses import scintillating
 from tests.compensate.scenes import (
     DOUBLE,
     EQUIVARIANT,
@@ -45,6 +44,7 @@ from torchsar.compensate.pulse_phase.pga import _KERNELS, View, window_width
 from torchsar.core import Chain, Estimate, Signal, use
 from torchsar.metrics import entropy, phase_rmse, residual_phase
 from torchsar.radar import InverseRadar
+from torchsar.study.bench.pulses import scintillating
 
 RADAR = InverseRadar(2e14, 150e9, 2000.0, 0.005)
 

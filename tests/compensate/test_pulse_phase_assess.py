@@ -51,7 +51,7 @@ def test_values_are_the_same_without_assessment(method, monkeypatch) -> None:
 
 @pytest.mark.parametrize("stage", [Sca, Pga, PgaSca, EntropyFixedPoint, LinkPhases, SharpestPhase, Autofocus])
 def test_stages_leave_the_assessment_out(stage) -> None:
-    from tests.audit.pulses import signal
+    from torchsar.study.bench.pulses import signal
 
     found = stage(assess=False)(signal(spread_points(2, 20, 10.0, seed=2)[0]))
     assert (found.outcome == Outcome.NOT_ASSESSED).all() and found.neutral == {"phase_rad": 0.0}

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from tests.compensate.turning import BINS, F64, OPTIONS, PRF, PULSES, K, noise, points
-from tests.direct.turntable import SMALL, Turntable
 from torchsar.compensate import (
     EntropyObjective,
     ImageEntropy,
@@ -21,6 +20,7 @@ from torchsar.compensate import (
 from torchsar.compensate.rotation.entropy_search import Method
 from torchsar.core import Draws, Estimate
 from torchsar.metrics import rotation_bounds
+from torchsar.study.bench.direct.turntable import SMALL, Turntable
 
 NARROW = Turntable(24e3, 480, 16, 0.45, 60, 0.3, 2.6)
 TINY = Turntable(40e3, 800, 24, 0.3, 40, 0.45)

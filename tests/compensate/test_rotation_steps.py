@@ -24,7 +24,6 @@ from tests.compensate.turning import (
     response,
     target,
 )
-from tests.direct.turntable import Turntable
 from torchsar.compensate.rotation.couplings import Neighbours, inner_products
 from torchsar.compensate.rotation.histories import (
     find_peaks,
@@ -37,6 +36,7 @@ from torchsar.compensate.rotation.histories import (
 from torchsar.compensate.rotation.motion import Motion, Sampling, image_of, warped_time, without_range_term
 from torchsar.compensate.rotation.scatterers import Fit, Scatterers, Step, _solver, solved
 from torchsar.radar.warp import warp
+from torchsar.study.bench.direct.turntable import Turntable
 
 SAMPLING = Sampling(WAVELENGTH, PRF, PULSES, len(RANGE_M), float(RANGE_M[0]), CELL)
 TIME = torch.arange(PULSES, dtype=F64) / PRF

@@ -8,7 +8,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.compensate.strips import CELLS, PULSES, RADAR, STRIP, judged, path_of, strips
 from torchsar.compensate import CorrectPath, StripAutofocus, strip_autofocus
 from torchsar.compensate.path.joint import cosines
 from torchsar.compensate.path.scatterers import Echoes, prominent_places
@@ -18,6 +17,7 @@ from torchsar.focus import ImageGrid, ProcessedBeam, TileImage
 from torchsar.metrics import phase_rmse, registered_error_db
 from torchsar.radar import StraightTrack, frequency_samples
 from torchsar.scene import Points
+from torchsar.study.bench.beside import CELLS, PULSES, RADAR, STRIP, judged, path_of, strips
 
 F64 = torch.float64
 RADIANS = 4 * math.pi / RADAR.wavelength_m

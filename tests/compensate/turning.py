@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchsar.radar import LIGHT_M_S, InverseRadar
 from torchsar.radar.warp import warp
+from torchsar.study.bench.rotations import points
 
 F64 = torch.float64
 WAVELENGTH, PRF, PULSES, BINS, CELL, OMEGA = 1.55e-6, 40e3, 800, 24, 0.3, 0.02
@@ -19,13 +20,6 @@ K = torch.tensor([10.0, 1000.0], dtype=F64)
 RANGE_M = CELL * (torch.arange(BINS, dtype=F64) - BINS // 2)
 RADAR = InverseRadar(LIGHT_M_S / WAVELENGTH, LIGHT_M_S / (2 * CELL), PRF)
 OPTIONS = {"wavelength_m": WAVELENGTH, "prf_hz": PRF, "range_m": RANGE_M}
-
-
-def points(seed: int = 0, count: int = 30) -> tuple[Tensor, Tensor, Tensor]:
-    """Cross range over 0.6 m, range over 5.6 m, complex amplitudes of 0.5 to 1.5."""
-    source = torch.Generator().manual_seed(seed)
-    x, y, level, phase = (torch.rand(count, generator=source, dtype=F64) for _ in range(4))
-    return 0.6 * (x - 0.5), 5.6 * (y - 0.5), torch.polar(0.5 + level, 2 * math.pi * phase)
 
 
 def echo(x: Tensor, y: Tensor, amplitude: Tensor, k: Tensor = K, yc_m: float = 0.0, n_pulse: int = PULSES) -> Tensor:

@@ -7,7 +7,6 @@ import math
 import pytest
 import torch
 
-from tests.direct.bistatic import C, Survey, echo
 from tests.direct.test_stripmap import peak
 from torchsar.core import Chain, Draws, Signal, use
 from torchsar.echo import simulate_bistatic
@@ -29,6 +28,7 @@ from torchsar.multichannel import (
 )
 from torchsar.radar import BistaticRadar, LinearFM
 from torchsar.scene import BandLimited, BistaticWorld, MovingPoints, Pattern
+from torchsar.study.bench.direct.bistatic import C, Survey, echo
 
 
 @pytest.mark.parametrize("duration_s", [10e-6, 9.9931e-6])

@@ -8,7 +8,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.direct.inverse import F64, Ladar, echo, still
 from torchsar.compensate import align_envelopes, autofocus, shift_range
 from torchsar.core import Draws, Signal
 from torchsar.echo import dechirped_echo
@@ -16,6 +15,7 @@ from torchsar.focus import AzimuthTransform, compress_dechirped
 from torchsar.metrics import impulse_response, phase_rmse
 from torchsar.radar import InverseRadar
 from torchsar.scene import Aircraft
+from torchsar.study.bench.direct.inverse import F64, Ladar, echo, still
 
 LADAR = Ladar(pulses=100, prf_hz=1000.0, cells=96)
 TRIALS = 2

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from tests.direct.stripmap import C, Instrument, echo
 from torchsar.compensate import DopplerCentroid, EffectiveVelocity
 from torchsar.core import Chain, Recording, use
 from torchsar.focus import OmegaK, OmegaKStolt, RangeCompress
 from torchsar.metrics import impulse_response
 from torchsar.radar import LinearFM, StripmapRadar
+from torchsar.study.bench.direct.stripmap import C, Instrument, echo
 
 
 def described(radar: Instrument, **more) -> StripmapRadar:

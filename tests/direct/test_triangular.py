@@ -9,7 +9,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.direct.triangular import F64, Ladar
 from torchsar.compensate import CompensateMotion, CorrectPulsePhase, RadialMotion, radial_motion, range_error
 from torchsar.core import Axis, Chain, Draws, Estimate, Signal, use
 from torchsar.echo import ladar_echo, simulate_ladar_record
@@ -18,6 +17,7 @@ from torchsar.metrics import impulse_response
 from torchsar.radar import TriangularLadar, sweep_middles
 from torchsar.repair import BlankTurningPoints, SplitSweeps
 from torchsar.scene import EverySample, LadarWorld, Points, Polynomial, Scene, Sinusoid, Speckle
+from torchsar.study.bench.direct.triangular import F64, Ladar
 
 BEAM_RAD = 60e-6
 MOTION = (Polynomial([0.3, 10.0]), Sinusoid(20e-6, 300.0, 20.0))

@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from tests.repair.triangles import ground, table1
 from torchsar.focus import ladar_limits, ladar_requirements
+from torchsar.study.bench.direct.triangles import ground, table1
 
 
 def rows(radar=None, n_period=1024, ranges=(1.5, 1.5), **bounds):

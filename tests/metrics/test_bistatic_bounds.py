@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from tests.helpers import radial_velocity_bound_m_s
-from tests.multichannel.helpers import published_radar, range_of, time_of
 from torchsar.metrics.bistatic_bounds import UNKNOWNS, bistatic_bounds
+from torchsar.study.bench.direct.moving import published_radar, range_of, time_of
 
 F64 = torch.float64
 RADAR = published_radar()

@@ -9,9 +9,9 @@ import math
 import pytest
 import torch
 
-from tests.multichannel.helpers import azimuth_echo, published_radar
 from torchsar.metrics import azimuth_response, replica_level, replica_zones
 from torchsar.multichannel import LeastSquares, PointMotion, doppler_offsets, focus_azimuth, reconstruct
+from torchsar.study.bench.direct.moving import azimuth_echo, published_radar
 
 F64 = torch.float64
 RADAR = published_radar()

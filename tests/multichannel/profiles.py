@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import torch
 
-from tests.multichannel.helpers import azimuth_echo
 from torchsar.metrics import replicas
 from torchsar.multichannel import PointMotion, doppler_offsets, focus_azimuth, reconstruct
+from torchsar.study.bench.direct.moving import azimuth_echo
 
 BAND_HZ, GATE_S, LONG = 337.5, 4.5, 3600
 

@@ -8,7 +8,6 @@ from importlib import import_module
 import pytest
 import torch
 
-from tests.multichannel.helpers import azimuth_echo, published_radar
 from torchsar.core import Outcome, Signal
 from torchsar.multichannel import (
     AlongTrackAutofocus,
@@ -26,6 +25,7 @@ from torchsar.multichannel import (
     WalkAmbiguity,
     balance,
 )
+from torchsar.study.bench.direct.moving import azimuth_echo, published_radar
 
 RADAR, N, GATE = published_radar(), 600, Dwell(2.5)
 STAGES = {

@@ -11,7 +11,6 @@ import math
 import pytest
 import torch
 
-from tests.multichannel.helpers import azimuth_echo, compressed_echo, published_radar, range_of, time_of
 from tests.multichannel.profiles import BAND_HZ, GATE_S, LONG, figures_of, focused, measured, motion_of
 from torchsar.core import Signal
 from torchsar.multichannel import (
@@ -27,6 +26,7 @@ from torchsar.multichannel import (
     reconstruct,
 )
 from torchsar.multichannel.azimuth import azimuth_filter
+from torchsar.study.bench.direct.moving import azimuth_echo, compressed_echo, published_radar, range_of, time_of
 
 F64 = torch.float64
 RADAR = published_radar()

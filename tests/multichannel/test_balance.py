@@ -7,7 +7,6 @@ import math
 import pytest
 import torch
 
-from tests.multichannel.helpers import compressed_echo, published_radar
 from torchsar.core import Signal
 from torchsar.multichannel import (
     CorrectBalance,
@@ -18,6 +17,7 @@ from torchsar.multichannel import (
     estimate_balance,
 )
 from torchsar.multichannel.clutter_fit import ClutterModel
+from torchsar.study.bench.direct.moving import compressed_echo, published_radar
 
 PHASE, GAIN, DELAY = (
     torch.tensor(x, dtype=torch.float64) for x in ([0.3, 0.0, -0.5], [0.5, 0.0, -1.0], [2e-9, 0.0, -9e-9])

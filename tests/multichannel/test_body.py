@@ -11,9 +11,8 @@ import torch
 from torchsar.multichannel import Extraction, Frame, PointMotion
 from torchsar.multichannel.body import body_echo, body_image, centred_motion, find_body, known_body
 from torchsar.multichannel.chip import Segments, chip_about
-
-from .helpers import compressed_echo
-from .ocean import EXTRACTION, GATE_S, RADAR, frame_of, ship
+from torchsar.study.bench.direct.moving import compressed_echo
+from torchsar.study.bench.ocean import EXTRACTION, GATE_S, RADAR, frame_of, ship
 
 POINT = {"u_r": 7.0, "u_a": -4.0, "y0": 20.0, "r0": 5010.0}
 WIDE = replace(EXTRACTION, range_m=100.0)

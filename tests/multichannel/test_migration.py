@@ -8,7 +8,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from tests.multichannel.helpers import compressed_echo, published_radar
 from torchsar.core import Signal
 from torchsar.metrics import impulse_response
 from torchsar.multichannel import (
@@ -25,6 +24,7 @@ from torchsar.multichannel import (
 )
 from torchsar.multichannel.azimuth import image_axis
 from torchsar.multichannel.reconstruct import doppler_axis
+from torchsar.study.bench.direct.moving import compressed_echo, published_radar
 
 RADAR = published_radar()
 N = 960

@@ -8,7 +8,6 @@ import warnings
 import pytest
 import torch
 
-from tests.multichannel.helpers import azimuth_echo, published_radar, range_of, time_of
 from tests.multichannel.profiles import motion_of
 from torchsar.core import Axis, Signal
 from torchsar.multichannel import (
@@ -18,6 +17,7 @@ from torchsar.multichannel import (
     Reconstruct,
     reconstruct,
 )
+from torchsar.study.bench.direct.moving import azimuth_echo, published_radar, range_of, time_of
 
 F64 = torch.float64
 quiet = pytest.mark.filterwarnings("ignore:at a pulse rate of")

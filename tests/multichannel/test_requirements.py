@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 import torch
 
-from tests.multichannel.helpers import azimuth_echo, published_radar
 from torchsar.metrics import replica_level, replica_zones
 from torchsar.multichannel import (
     LeastSquares,
@@ -22,6 +21,7 @@ from torchsar.multichannel import (
     reconstruct,
 )
 from torchsar.multichannel.limits import singular_speeds_m_s
+from torchsar.study.bench.direct.moving import azimuth_echo, published_radar
 
 RADAR = published_radar(transmit_range=(-243.0, 0.0208, 1e-6, 1e-9))
 STILL: dict[str, Any] = {"u_r_m_s": (0.0, 0.0), "u_a_m_s": (0.0, 0.0)}

@@ -7,7 +7,6 @@ import math
 import pytest
 import torch
 
-from tests.multichannel.helpers import azimuth_echo, published_radar, range_of
 from tests.multichannel.profiles import LONG, figures_of, focused, motion_of
 from torchsar.multichannel import (
     ElementPattern,
@@ -22,6 +21,7 @@ from torchsar.multichannel import (
 from torchsar.multichannel.azimuth import azimuth_filter
 from torchsar.multichannel.reconstruct import refuse_channels
 from torchsar.multichannel.response import band_matrix, first_bin, shared_response
+from torchsar.study.bench.direct.moving import azimuth_echo, published_radar, range_of
 
 F64, C128 = torch.float64, torch.complex128
 PRF = (125.0, 160.0, 170.0, 180.0, 185.0, 187.0, 187.5, 190.0, 195.0, 200.0, 250.0)

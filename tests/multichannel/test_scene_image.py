@@ -21,9 +21,9 @@ from torchsar.multichannel import (
     correct_balance,
 )
 from torchsar.multichannel.scene_image import placed, unbalanced
+from torchsar.study.bench.direct.moving import published_radar
+from torchsar.study.bench.ocean import EXTRACTION, RADAR, flow, frame_of, ship
 
-from .helpers import published_radar
-from .ocean import EXTRACTION, RADAR, flow, frame_of, ship
 from .test_balance import clutter, flat
 
 

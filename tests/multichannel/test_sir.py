@@ -8,11 +8,11 @@ import warnings
 import pytest
 import torch
 
-from tests.multichannel.helpers import azimuth_echo, published_radar, range_of, time_of
 from torchsar.core import Signal
 from torchsar.multichannel import LeastSquares, MinimumMeanSquare, PointMotion, SignalIntensityRatio
 from torchsar.multichannel.response import first_bin
 from torchsar.multichannel.velocity.sir import signal_intensity
+from torchsar.study.bench.direct.moving import azimuth_echo, published_radar, range_of, time_of
 
 F64 = torch.float64
 RADAR = published_radar()

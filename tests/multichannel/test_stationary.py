@@ -7,7 +7,6 @@ import math
 import pytest
 import torch
 
-from tests.multichannel.helpers import compressed_echo, published_radar
 from torchsar.core import centred_ifft
 from torchsar.metrics import impulse_response
 from torchsar.multichannel import (
@@ -18,6 +17,7 @@ from torchsar.multichannel import (
     reconstruct,
     stationary_image,
 )
+from torchsar.study.bench.direct.moving import compressed_echo, published_radar
 
 RADAR = published_radar()
 

@@ -7,7 +7,6 @@ import math
 import pytest
 import torch
 
-from tests.multichannel.helpers import compressed_echo, published_radar
 from tests.multichannel.test_balance import clutter, flat
 from torchsar.core import Signal
 from torchsar.multichannel import (
@@ -17,6 +16,7 @@ from torchsar.multichannel import (
     RemoveSynchronisation,
 )
 from torchsar.multichannel.synchronise import estimate_synchronisation, remove_synchronisation
+from torchsar.study.bench.direct.moving import compressed_echo, published_radar
 
 RADAR = published_radar()
 

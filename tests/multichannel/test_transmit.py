@@ -7,7 +7,6 @@ import math
 import pytest
 import torch
 
-from tests.multichannel.helpers import azimuth_echo, compressed_echo, published_radar, time_of
 from torchsar.core import Signal
 from torchsar.multichannel import (
     AzimuthScaling,
@@ -21,6 +20,7 @@ from torchsar.multichannel import (
 from torchsar.multichannel.azimuth import azimuth_filter
 from torchsar.multichannel.response import doppler_centre_hz
 from torchsar.multichannel.transmit import neglected_transmit_phase_rad
+from torchsar.study.bench.direct.moving import azimuth_echo, compressed_echo, published_radar, time_of
 
 K = (-243.0, 0.0208, -1.3e-6, 2e-9)
 N = 900

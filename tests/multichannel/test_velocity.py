@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from tests.helpers import radial_velocity_bound_m_s
-from tests.multichannel.helpers import azimuth_echo, compressed_echo, published_radar
 from torchsar.core import Axis, Draws, Outcome, Signal
 from torchsar.echo.sea import sea_echo
 from torchsar.metrics.bistatic_bounds import bistatic_bounds
@@ -31,6 +30,7 @@ from torchsar.multichannel.velocity.likelihood import PointLikelihood, explained
 from torchsar.multichannel.velocity.model import UNKNOWNS, moved, noise_beside, phase_slopes, point_phasor
 from torchsar.multichannel.velocity.whitening import line_whitening
 from torchsar.scene import KSea, Pattern
+from torchsar.study.bench.direct.moving import azimuth_echo, compressed_echo, published_radar
 
 F64, C128 = torch.float64, torch.complex128
 RADAR, N, GATE = published_radar(), 900, Dwell(4.5)

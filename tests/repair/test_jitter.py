@@ -7,7 +7,6 @@ import math
 import pytest
 import torch
 
-from tests.audit.repairs import jitter
 from tests.helpers import small_recording
 from torchsar.core import Chain, Draws, Outcome, use
 from torchsar.echo import PeriodicJitter
@@ -26,6 +25,7 @@ from torchsar.repair import (
 )
 from torchsar.repair.jitter import Exact, correct_jitter_exact
 from torchsar.repair.jitter_blind import detect_jitter_period
+from torchsar.study.bench.repairs import jitter
 
 OFFSETS = torch.tensor([0.0, 0.18, -0.12, 0.07], dtype=torch.float64)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 import torch
 
-from tests.repair.triangles import ground, record, sweeps, table1
 from torchsar.core import Axis, Chain, Draws, Recording, Signal, use
 from torchsar.echo import simulate_ladar, simulate_ladar_record
 from torchsar.repair import (
@@ -18,6 +17,7 @@ from torchsar.repair import (
 from torchsar.repair.analytic import delayed
 from torchsar.repair.triangle import canonical_ramps, split_record
 from torchsar.scene import EverySample, LadarWorld, Points, Polynomial
+from torchsar.study.bench.direct.triangles import ground, record, sweeps, table1
 
 
 def rms(x, first=12, last=2):

@@ -7,10 +7,10 @@ import math
 import pytest
 import torch
 
-from tests.repair.triangles import ground, table1
 from torchsar.core import Signal, unit_phasor
 from torchsar.repair import CalibrateSweeps, calibrate_sweeps
 from torchsar.repair.triangle_calibrate import sweep_error_s
+from torchsar.study.bench.direct.triangles import ground, table1
 
 
 def error_turns(radar, u, ramp):

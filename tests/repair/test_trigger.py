@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from tests.repair.triangles import ground, record, sweeps, table1
 from torchsar.core import Chain, Outcome, Signal
 from torchsar.repair import BlankTurningPoints, SplitSweeps, find_trigger
+from torchsar.study.bench.direct.triangles import ground, record, sweeps, table1
 
 SHARES = (0.0, 0.07, 0.3, 0.511, 0.97)
 

@@ -10,7 +10,7 @@ try:
 except ImportError as error:
     raise ImportError("torchsar.plot needs matplotlib: pip install 'torchsar-lab[study]'") from error
 
-from torchsar.plot.curves import alike, curves, panels, scatterers, trade
+from torchsar.plot.curves import alike, curves, marks, panels, scatterers, trade
 from torchsar.plot.images import (
     boxes,
     contours,
@@ -40,6 +40,7 @@ __all__ = [
     "image",
     "images",
     "level",
+    "marks",
     "name_and_unit",
     "overlays",
     "panels",

@@ -21,6 +21,7 @@ from torchsar.plot.style import (
     ELONGATED,
     HIGHEST,
     INK,
+    MARKERS,
     SECOND,
     legend_below,
     new_figure,
@@ -174,6 +175,32 @@ def panels(parts: Sequence[Mapping[str, Any]]) -> list[Figure]:
         The figures, one for each part.
     """
     return [curves_of(panel_width(len(parts)), **part) for part in parts]
+
+
+@styled
+def marks(names: Sequence[str], series: Mapping[str, np.ndarray], xlabel: str, title: str = "") -> Figure:
+    """Draw values with their intervals, one line of the panel for each name.
+
+    Args:
+        names: Names of the lines, from top to bottom.
+        series: Values with the lower and the upper ends of their intervals, shape (name, 3), by
+            what they are; NaN is not drawn.
+        xlabel: Label of the horizontal axis.
+        title: Title of the figure.
+
+    Returns:
+        The figure.
+    """
+    figure, axes = new_figure(ALONE, 0.9 + 0.24 * len(names))
+    for i, (label, rows) in enumerate(series.items()):
+        at = -np.arange(len(names)) + 0.12 * (0.5 * (len(series) - 1) - i)
+        value, *ends = rows.T
+        reach = np.abs(np.stack(ends) - value)
+        axes.errorbar(value, at, xerr=reach, fmt=MARKERS[i], color=COLOURS[i], markersize=4, linewidth=1, label=label)
+    axes.set_yticks(-np.arange(len(names)), names)
+    axes.set(xlabel=xlabel, title=wrapped_title(title, ALONE))
+    legend_below(figure, axes)
+    return figure
 
 
 @styled

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from typing import Any
 
 from tqdm import tqdm
@@ -25,6 +26,20 @@ def progress(total: int, unit: str, done: int = 0) -> Any:
     """
     every = 0.5 if sys.stderr.isatty() else _EVERY_S
     return tqdm(total=total, initial=done, unit=f" {unit}", mininterval=every, miniters=1, delay=every, leave=False)
+
+
+def told(unit: str) -> Callable[[str, int], object]:
+    """Return a function that is told the name of each part of work before it, and their number."""
+    bars: list[Any] = []
+
+    def say(name: str, total: int) -> None:
+        if bars:
+            bars[0].update(1)
+        else:
+            bars.append(progress(total, unit))
+        bars[0].set_description_str(name)
+
+    return say
 
 
 def clock(seconds: float) -> str:

@@ -10,9 +10,9 @@ from torchsar.core import Draws, Signal
 from torchsar.echo import simulate_bistatic
 from torchsar.multichannel import Detector, Extraction, ImageMovers
 from torchsar.scene import BandLimited, BistaticWorld, Fleet, KSea, Ship
+from torchsar.study.bench.direct.moving import published_radar
 
-from .helpers import published_radar
-
+# settings of the scenes and methods, by choice
 GATE_S = 2.0
 EXTRACTION = Extraction(along_m=60.0, range_m=30.0, integration_s=GATE_S, segment_s=0.4)
 RADAR = published_radar()

@@ -11,10 +11,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tests.audit.frame import SNR_DB, Batch, Entry, Quantity, World, nothing, rms, unlit
-from tests.audit.strips import turntable
-from tests.direct.stripmap import Instrument, echo
-from tests.repair.triangles import ground, record, table1
 from torchsar.core import Draws, Estimate, Recording, Signal, Stage
 from torchsar.echo import ChannelResponse, QuadratureError, apply_impairments, simulate
 from torchsar.echo.jitter import sample_unevenly
@@ -38,8 +34,14 @@ from torchsar.repair import (
 )
 from torchsar.repair.response import band_axis, band_grid
 from torchsar.scene import Dwell, Points, RandomPoints, Scene, Speckle, StripmapWorld
+from torchsar.study.bench.direct.stripmap import Instrument, echo
+from torchsar.study.bench.direct.triangles import ground, record, table1
+from torchsar.study.bench.frame import SNR_DB, Batch, Bench, Entry, Quantity, World, rms
+from torchsar.study.bench.nothing import nothing, unlit
+from torchsar.study.bench.strips import turntable
 
 F64, C128 = torch.float64, torch.complex128
+# settings of the scenes and methods, by choice
 RADAR = StripmapRadar(3.2e9, LinearFM(200e6, 1e-6), 250e6, 800.0, 7000.0, 700e3, integration_s=0.2)
 LINES, CELLS = 256, 256
 IMAGE = (288, 640)  # lines and samples of recordings whose response is sought
@@ -310,6 +312,7 @@ def split(x: Tensor) -> tuple[Signal, Estimate]:
     return SplitSweeps(TABLE1, "search")(Signal(x, TABLE1.record_axes(*x.shape[-2:])))
 
 
+# settings of the scenes and methods, by choice
 MANY = RandomPoints(40, 1100.0, 200.0, spread_db=6.0)
 FIELD = Speckle(3000, 1100.0, 380.0)
 
@@ -351,7 +354,7 @@ def entries() -> list[Entry]:
     sharp = partial(estimate_response_sharpest, **few)
     return [
         Entry(
-            "repair.EstimateImbalance",
+            "EstimateImbalance",
             EstimateImbalance(),
             [
                 *none,
@@ -364,7 +367,7 @@ def entries() -> list[Entry]:
             [Quantity("gain", 0.2, floor=1e-3), Quantity("phase_rad", 0.3, floor=1e-3)],
         ),
         Entry(
-            "repair.BalanceQuadrature",
+            "BalanceQuadrature",
             BalanceQuadrature(),
             [
                 *[world for world in none if world.name == "zeros"],
@@ -374,7 +377,7 @@ def entries() -> list[Entry]:
             [Quantity("gain_db", 0.5, floor=0.01), Quantity("phase_deg", 4.0, floor=0.1)],
         ),
         Entry(
-            "repair.BlindJitter",
+            "BlindJitter",
             BlindJitter(max_period=8),
             [
                 *none_of((64, 512)),
@@ -388,7 +391,7 @@ def entries() -> list[Entry]:
             [Quantity("offset_samples", 0.03, same_offsets, 2e-4)],
         ),
         Entry(
-            "repair.PilotJitter",
+            "PilotJitter",
             lambda x: PilotJitter(8)(signal(torch.zeros(len(x), 4, 4, dtype=x.dtype)), pilot=x),
             [
                 *nothing((1024,)),
@@ -398,25 +401,25 @@ def entries() -> list[Entry]:
             ],
             [Quantity("offset_samples", 0.03, same_offsets, 1e-6)],
         ),
-        Entry("repair.EstimateResponse", EstimateResponse(RADAR, sharp), images, phase),
+        Entry("EstimateResponse", EstimateResponse(RADAR, sharp), images, phase),
         Entry(
-            "repair.EstimateResponse:default",
+            "EstimateResponse:default",
             EstimateResponse(RADAR),
             [images[0], *(w for w in images if (w.name, w.snr_db) in (("own", 20.0), ("clutter", 20.0)))],
             phase,
         ),
         Entry(
-            "repair.EstimateFlatResponse",
+            "EstimateFlatResponse",
             EstimateFlatResponse(RADAR, sharp),
             [images[0], World("own", response(MANY, 20.0, reference="flat"), 20.0)],
             phase,
         ),
-        Entry("repair.estimate_response_points", EstimateResponse(RADAR, estimate_response_points), images, phase),
-        Entry("repair.SubtractInterference", repaired(SubtractInterference()), waves, cured),
-        Entry("repair.NotchInterference", repaired(NotchInterference()), waves, cured),
-        Entry("repair.DropInterference", repaired(DropInterference()), waves, cured),
+        Entry("estimate_response_points", EstimateResponse(RADAR, estimate_response_points), images, phase),
+        Entry("SubtractInterference", repaired(SubtractInterference()), waves, cured),
+        Entry("NotchInterference", repaired(NotchInterference()), waves, cured),
+        Entry("DropInterference", repaired(DropInterference()), waves, cured),
         Entry(
-            "repair.LineIntegrity",
+            "LineIntegrity",
             placed,
             [
                 World("own", numbers(0.0, 0.0)),
@@ -427,7 +430,7 @@ def entries() -> list[Entry]:
             [Quantity("number", 0.02, wrong_numbers)],
         ),
         Entry(
-            "repair.find_trigger",
+            "find_trigger",
             lambda x: find_trigger(x, TABLE1),
             [
                 *no_record(TABLE1, 24, 2 * TABLE1.sweep_samples),
@@ -437,13 +440,13 @@ def entries() -> list[Entry]:
             [Quantity("trigger_s", 2e-8, timing(TABLE1))],
         ),
         Entry(  # which side of the reference the scene lies on must be given: it shows in no sample
-            "repair.find_trigger:nearer",
+            "find_trigger:nearer",
             lambda x: find_trigger(x, TABLE1, nearer=True),
             [World("direct", trigger(TABLE1, 24, snr, scatterers=((-1.5, 1.0),)), snr) for snr in (-20.0, 10.0)],
             [Quantity("trigger_s", 2e-8, timing(TABLE1))],
         ),
         Entry(
-            "repair.find_trigger:real",
+            "find_trigger:real",
             lambda x: find_trigger(x, GROUND),
             [
                 *no_record(GROUND, 32, 9000),
@@ -455,7 +458,7 @@ def entries() -> list[Entry]:
             [Quantity("trigger_s", 1e-8, timing(GROUND))],
         ),
         Entry(
-            "repair.SplitSweeps",
+            "SplitSweeps",
             split,
             [
                 *no_record(TABLE1, 24, 2 * TABLE1.sweep_samples),
@@ -466,4 +469,8 @@ def entries() -> list[Entry]:
     ]
 
 
+# settings of the scenes and methods, by choice
 SCATTERED = tuple((0.3 + 0.05 * i, 1 + 0.5 * math.sin(7.0 * i * i)) for i in range(40))
+
+
+BENCH = Bench("repair", "damage by a receiver", entries)

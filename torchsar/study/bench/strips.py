@@ -9,7 +9,6 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from tests.audit.frame import SNR_DB, Batch, Entry, Quantity, World, nothing
 from torchsar.compensate import (
     DopplerCentroid,
     EffectiveVelocity,
@@ -32,12 +31,16 @@ from torchsar.scene import (
     TurntableWorld,
     UniformStartPhase,
 )
+from torchsar.study.bench.frame import SNR_DB, Batch, Bench, Entry, Quantity, World
+from torchsar.study.bench.nothing import nothing
 
 F64 = torch.float64
+# settings of the scenes and methods, by choice
 LINES, CELLS, DWELL_S = 768, 192, 1.0
 RADAR = StripmapRadar(
     3.2e9, LinearFM(40e6, 0.5e-6), 50e6, 400.0, 120.0, 4000.0, pointing_doppler_hz=0.0, integration_s=DWELL_S
 )
+# settings of the scenes and methods, by choice
 SQUINTED = replace(RADAR, pointing_doppler_hz=2 * 120 / RADAR.wavelength_m * math.sin(math.radians(8)))
 FAST = StripmapRadar(
     3.2e9, LinearFM(100e6, 0.4e-6), 125e6, 4000.0, 7000.0, 700e3, pointing_doppler_hz=652.0, integration_s=0.1
@@ -142,6 +145,7 @@ def one_row(trials: int, seed: int) -> Batch:
     return Batch(Signal(batch.data.data[..., 60:61], RADAR.raw_axes(LINES, 1)), batch.truth)
 
 
+# settings of the scenes and methods, by choice
 SPECKLE = Speckle(600, 330.0, 250.0)
 SCENES: Sequence[World] = (
     *(World("own", strip(snr_db=snr), snr) for snr in SNR_DB),
@@ -156,6 +160,7 @@ SCENES: Sequence[World] = (
 )
 NOTHING = nothing((LINES, CELLS), lambda x: Signal(x, RADAR.raw_axes(LINES, CELLS)))
 OTHER_SYSTEM = World("turntable", turntable)
+# worlds, with settings by choice
 ALIASED = World("aliased", strip(doppler_hz=RADAR.prf_hz), 10.0)
 SHORT = World("short dwell", strip(beam_s=0.4), 10.0)
 
@@ -171,6 +176,7 @@ def middle_of(found: Tensor, truth: Tensor) -> Tensor:
     return circular_hz(found, truth[..., None]).amax(-1)
 
 
+# tolerances of use
 BASEBAND = [Quantity("doppler_baseband_hz", DOPPLER_HZ, circular_hz, 0.5)]
 
 
@@ -198,6 +204,7 @@ def image(scene: Scene) -> Callable[[int, int], Batch]:
     return draw
 
 
+# settings of the scenes and methods, by choice
 POINT_WORLDS = (
     *nothing((512, 192), lambda x: Signal(x, FAST.image_axes(FAST.raw_axes(512, 192)))),
     *(World("own", points(snr), snr) for snr in (-30.0, -20.0, -10.0, 0.0, 20.0, 40.0)),
@@ -205,26 +212,36 @@ POINT_WORLDS = (
 )
 
 
+def velocity() -> Entry:
+    """The effective velocity of a strip."""
+    baseband, found = PhaseIncrement(RADAR), EffectiveVelocity(OmegaK(RADAR), 25.0)
+    return Entry(
+        "EffectiveVelocity",
+        lambda x: found(x, baseband(x)["doppler_baseband_hz"]),
+        (*NOTHING, *SCENES, OTHER_SYSTEM, SHORT, World("beyond the search", strip(velocity_m_s=40.0), 10.0)),
+        [Quantity("velocity_m_s", VELOCITY_M_S, floor=0.05)],
+    )
+
+
 def entries() -> list[Entry]:
-    """Entries of the stripmap estimators."""
-    dop, baseband, velocity = DopplerCentroid(RADAR), PhaseIncrement(RADAR), EffectiveVelocity(OmegaK(RADAR), 25.0)
+    """Estimators of the Doppler centroid."""
     return [
-        Entry("compensate.PhaseIncrement", PhaseIncrement(RADAR), (*NOTHING, *SCENES, ALIASED), BASEBAND),
-        Entry("compensate.EnergyCentre", EnergyCentre(RADAR), (*NOTHING, *SCENES, ALIASED), BASEBAND),
         Entry(
-            "compensate.DopplerCentroid",
-            dop,
+            "DopplerCentroid",
+            DopplerCentroid(RADAR),
             (*NOTHING, *SCENES, ALIASED, OTHER_SYSTEM, SHORT),
             [Quantity("doppler_hz", DOPPLER_HZ, floor=0.5)],
         ),
+        Entry("PhaseIncrement", PhaseIncrement(RADAR), (*NOTHING, *SCENES, ALIASED), BASEBAND),
+        Entry("EnergyCentre", EnergyCentre(RADAR), (*NOTHING, *SCENES, ALIASED), BASEBAND),
         Entry(
-            "compensate.DopplerCentroid:squinted",
+            "DopplerCentroid:squinted",
             DopplerCentroid(SQUINTED),
             [World("own", strip(snr_db=snr, radar=SQUINTED), snr) for snr in (-10.0, 10.0)],
             [Quantity("doppler_hz", DOPPLER_HZ, floor=0.5)],
         ),
         Entry(
-            "compensate.DopplerCentroid:fast",
+            "DopplerCentroid:fast",
             DopplerCentroid(FAST),
             [
                 World("own", strip(lambda: RandomPoints(24, 2500.0, 60.0), snr, FAST, 1024, 512), snr)
@@ -233,11 +250,8 @@ def entries() -> list[Entry]:
             [Quantity("doppler_hz", 0.25 * float(FAST.azimuth_rate_hz_s(700e3, 7000.0)) * 0.1, floor=0.5)],
             share=0.3,
         ),
-        Entry(
-            "compensate.EffectiveVelocity",
-            lambda x: velocity(x, baseband(x)["doppler_baseband_hz"]),
-            (*NOTHING, *SCENES, OTHER_SYSTEM, SHORT, World("beyond the search", strip(velocity_m_s=40.0), 10.0)),
-            [Quantity("velocity_m_s", VELOCITY_M_S, floor=0.05)],
-        ),
-        Entry("compensate.PointDoppler", PointDoppler(FAST), POINT_WORLDS, [Quantity("doppler_hz", 60.0, floor=0.5)]),
+        Entry("PointDoppler", PointDoppler(FAST), POINT_WORLDS, [Quantity("doppler_hz", 60.0, floor=0.5)]),
     ]
+
+
+BENCH = Bench("doppler", "the Doppler centroid of a strip, or the Doppler of a point", entries)

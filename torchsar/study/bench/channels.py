@@ -10,10 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tests.audit.frame import SNR_DB, Batch, Entry, Quantity, World, nothing, rms, unlit
-from tests.direct.bistatic import Survey
-from tests.multichannel import ocean
-from tests.multichannel.helpers import azimuth_echo, compressed_echo, published_radar
 from torchsar.core import Draws, Estimate, Signal
 from torchsar.echo import simulate_bistatic
 from torchsar.multichannel import (
@@ -43,8 +39,15 @@ from torchsar.multichannel import (
 )
 from torchsar.radar import BistaticRadar, LinearFM
 from torchsar.scene import BandLimited, BistaticWorld, KSea, MovingPoints, Pattern
+from torchsar.study.bench import ocean
+from torchsar.study.bench.direct.bistatic import Survey
+from torchsar.study.bench.direct.moving import azimuth_echo, compressed_echo, published_radar
+from torchsar.study.bench.frame import SNR_DB, Batch, Bench, Entry, Quantity, World, rms
+from torchsar.study.bench.nothing import nothing, unlit
+from torchsar.study.bench.strips import velocity
 
 F64, C128 = torch.float64, torch.complex128
+# settings of the scenes and methods, by choice
 RADAR, PULSES, GATE_S = published_radar(), 900, 4.5
 GATE, SEARCH = Dwell(GATE_S), Search(u_r_m_s=15.0, u_a_m_s=6.0, y0_m=100.0, u_a_step_m_s=1.0)
 FIVE = published_radar(channel_m=(-1.0, -0.5, 0.0, 0.5, 1.0))
@@ -381,10 +384,8 @@ def bare_interferometry(x: Signal) -> Estimate:
     return interferometry(x.data, RADAR, PointMotion.of(RADAR, x.data), GATE)
 
 
-def entries() -> list[Entry]:
-    """Entries of the estimators of several channels."""
-    sync = EstimateSynchronisation(RADAR)
-    dummy = Signal(torch.zeros(3, 60, dtype=C128), RADAR.axes(60))
+def moving() -> list[Entry]:
+    """Estimators of the velocity of moving points."""
     start = ("u_r_m_s", "u_a_m_s", "y0_m")
     near = worlds(start)
     in_range = nothing(
@@ -404,38 +405,33 @@ def entries() -> list[Entry]:
     lone = MovingPointVelocity(LONE, GATE, search=SEARCH)
     ranged = [World("direct", lines(snr), snr) for snr in (-40.0, -30.0, -20.0, -10.0, 10.0)]
     ranged += [World("direct raw", raw(snr), snr) for snr in (-20.0, 10.0)]
-    balance = [
-        Quantity("phase_rad", 0.1, circular, 1e-3),
-        Quantity("gain_db", 1.0, floor=0.02),
-        Quantity("delay_s", 3e-9, floor=2e-11),
-    ]
     return [
-        Entry("multichannel.MovingPointVelocity", moving, worlds(), [U_R, U_A, Y0]),
+        Entry("MovingPointVelocity", moving, worlds(), [U_R, U_A, Y0]),
         Entry(
-            "multichannel.MovingPointVelocity:one channel",
+            "MovingPointVelocity:one channel",
             lone,
             [World("direct", line(snr, LONE), snr) for snr in (0.0, 20.0)],
             [U_R, U_A, Y0],
         ),
         Entry(
-            "multichannel.MovingPointVelocity:beam",
+            "MovingPointVelocity:beam",
             MovingPointVelocity(RADAR, ElementBeam(), search=SEARCH),
             [World("sea and point", seen_in_sea(snr), snr) for snr in (10.0, 30.0)],
             [U_R, U_A, Y0],
         ),
-        Entry("multichannel.interferometry", bare_interferometry, known, [U_R, Y0]),
-        Entry("multichannel.Interferometry", Interferometry(RADAR, GATE), known, [U_R, Y0]),
+        Entry("interferometry", bare_interferometry, known, [U_R, Y0]),
+        Entry("Interferometry", Interferometry(RADAR, GATE), known, [U_R, Y0]),
         Entry(
-            "multichannel.AlongTrackAutofocus",
+            "AlongTrackAutofocus",
             AlongTrackAutofocus(RADAR, GATE, half_m_s=8.0),
             worlds(("u_r_m_s", "y0_m")),
             [U_A],
         ),
-        Entry("multichannel.LikelihoodVelocity", LikelihoodVelocity(RADAR, GATE), near, [U_R, U_A, Y0]),
-        Entry("multichannel.GradientVelocity", GradientVelocity(RADAR, GATE), near, [U_R, U_A, Y0]),
-        Entry("multichannel.SignalIntensityRatio", SignalIntensityRatio(RADAR, 337.5), known, [U_R]),
+        Entry("LikelihoodVelocity", LikelihoodVelocity(RADAR, GATE), near, [U_R, U_A, Y0]),
+        Entry("GradientVelocity", GradientVelocity(RADAR, GATE), near, [U_R, U_A, Y0]),
+        Entry("SignalIntensityRatio", SignalIntensityRatio(RADAR, 337.5), known, [U_R]),
         Entry(
-            "multichannel.WalkAmbiguity",
+            "WalkAmbiguity",
             WalkAmbiguity(RADAR),
             [
                 *unlit(in_range),
@@ -445,13 +441,13 @@ def entries() -> list[Entry]:
             [Quantity("ambiguity", 0.5)],
         ),
         Entry(
-            "multichannel.MigratingLines",
+            "MigratingLines",
             MigratingLines(RADAR, MovingPointVelocity(RADAR, Dwell(1.8), search=SEARCH), one_line=True),
             [*in_range, *ranged],
             [U_R, U_A, Y0],
         ),
         Entry(
-            "multichannel.MoversImage",
+            "MoversImage",
             lambda signal: strongest(image(signal)[1]),
             [
                 *nothing((3, 540, 120), lambda x: Signal(x, RADAR.axes(540, 120))),
@@ -461,8 +457,21 @@ def entries() -> list[Entry]:
             ],
             [Quantity("u_r_m_s", DEFOCUS_M_S, nearest, 0.01)],
         ),
+    ]
+
+
+def entries() -> list[Entry]:
+    """Estimators of the errors of channels and clocks."""
+    sync = EstimateSynchronisation(RADAR)
+    dummy = Signal(torch.zeros(3, 60, dtype=C128), RADAR.axes(60))
+    balance = [
+        Quantity("phase_rad", 0.1, circular, 1e-3),
+        Quantity("gain_db", 1.0, floor=0.02),
+        Quantity("delay_s", 3e-9, floor=2e-11),
+    ]
+    return [
         Entry(
-            "multichannel.EstimateBalance",
+            "EstimateBalance",
             EstimateBalance(RADAR, FlatBand(360.0), 2),
             [
                 *nothing((3, 256, 96), lambda x: Signal(x, RADAR.axes(256, 96))),
@@ -475,7 +484,7 @@ def entries() -> list[Entry]:
             balance,
         ),
         Entry(
-            "multichannel.EstimateBalance:pattern",
+            "EstimateBalance:pattern",
             EstimateBalance(RADAR),
             [
                 *nothing((3, 256, 96), lambda x: Signal(x, RADAR.axes(256, 96))),
@@ -485,7 +494,7 @@ def entries() -> list[Entry]:
             balance,
         ),
         Entry(
-            "multichannel.EstimateBalance:five channels",
+            "EstimateBalance:five channels",
             EstimateBalance(FIVE),
             [
                 World("own", clutter(beam, 20.0, radar=FIVE), 20.0),
@@ -494,7 +503,7 @@ def entries() -> list[Entry]:
             balance,
         ),
         Entry(
-            "multichannel.ClutterSynchronisation",
+            "ClutterSynchronisation",
             ClutterSynchronisation(RADAR, 337.5),
             [
                 *nothing((3, 256, 96), lambda x: Signal(x, RADAR.axes(256, 96))),
@@ -505,9 +514,13 @@ def entries() -> list[Entry]:
             [Quantity("phase_rad", 0.5, circular, 0.05)],
         ),
         Entry(
-            "multichannel.EstimateSynchronisation",
+            "EstimateSynchronisation",
             lambda x: sync(dummy.with_data(x[:, None, :, 0].expand(-1, 3, -1)), direct_path=x),
             [*unlit(nothing((60, 64))), *(World("direct", direct_path(snr), snr) for snr in SNR_DB)],
             [Quantity("phase_rad", 0.5, circular, 1e-4), Quantity("delay_s", 5e-9, floor=1e-13)],
         ),
     ]
+
+
+BENCH = Bench("channels", "errors of several azimuth channels, and of their clocks", entries)
+VELOCITY = Bench("velocity", "the velocity of a strip, or of a moving point", lambda: [velocity(), *moving()])

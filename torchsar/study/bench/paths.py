@@ -8,10 +8,6 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from tests.audit.frame import Batch, Entry, Quantity, World, nothing
-from tests.audit.pulses import PHASES
-from tests.compensate import strips as of_strips
-from tests.compensate.scenes import turned, white
 from torchsar.compensate import PathAutofocus, PathPhase, StripAutofocus
 from torchsar.core import Draws, Estimate, Signal
 from torchsar.echo import simulate_path
@@ -30,9 +26,15 @@ from torchsar.scene import (
     StraightPath,
     Sway,
 )
+from torchsar.study.bench import beside as of_strips
+from torchsar.study.bench.frame import Batch, Bench, Entry, Quantity, World
+from torchsar.study.bench.nothing import nothing
+from torchsar.study.bench.pulses import PHASES, turned, white
 
+# settings of the scenes and methods, by choice
 PULSES, CELLS = 64, 64
 KNOWN = ("frequency_hz", "transmitter_m", "path_reference_m")
+# settings of the scenes and methods, by choice
 RADAR = InverseRadar(9.6e9, 300e6, 64.0)
 FLIGHT = Flight(StraightPath((-700.0, -20.0, 700.0), (0.0, 40.0, 0.0)), Sway(x=[Sinusoid(0.2, 1.5)]))
 FEW = RandomPoints(20, 20.0, 16.0)
@@ -147,7 +149,10 @@ def entries() -> list[Entry]:
         World("one point", strips(Points([3.0], [-2.0], random_phase=True), 0.0), 0.0),
     )
     return [
-        Entry("compensate.StripAutofocus", strip_autofocus, seen, ABEAM, share=0.05),
-        Entry("compensate.PathPhase", phase, worlds, PHASES, share=0.1),
-        Entry("compensate.PathAutofocus", path_autofocus, paths, LINE_OF_SIGHT, share=0.1),
+        Entry("PathPhase", phase, worlds, PHASES, share=0.1),
+        Entry("PathAutofocus", path_autofocus, paths, LINE_OF_SIGHT, share=0.1),
+        Entry("StripAutofocus", strip_autofocus, seen, ABEAM, share=0.05),
     ]
+
+
+BENCH = Bench("path", "phases and errors of antennas on any path", entries)

@@ -7,8 +7,6 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from tests.audit.frame import SNR_DB, Batch, Entry, Quantity, World, nothing, rms
-from tests.direct.triangular import Ladar
 from torchsar.compensate import (
     MirrorProduct,
     MlPeak,
@@ -20,8 +18,12 @@ from torchsar.core import Draws, Signal
 from torchsar.echo import simulate_ladar
 from torchsar.radar import LIGHT_M_S, TriangularLadar
 from torchsar.scene import LadarWorld, LetterE, Points, Polynomial, Scene, Sinusoid, Speckle
+from torchsar.study.bench.direct.triangular import Ladar
+from torchsar.study.bench.frame import SNR_DB, Batch, Bench, Entry, Quantity, World, rms
+from torchsar.study.bench.nothing import nothing
 
 F64 = torch.float64
+# settings of the scenes and methods, by choice
 PERIODS = 96
 RADAR = TriangularLadar(LIGHT_M_S / 1.55e-6, 5e9, 16e-6, 16e6, 60.0, 3000.0)
 MOTION = (Polynomial([0.3, 20.0]), Sinusoid(3e-6, 2000.0, 20.0))
@@ -81,6 +83,7 @@ def slow(found: Tensor, truth: Tensor) -> Tensor:
     return rms(found - truth)
 
 
+# tolerances of use
 JUDGED = [Quantity("velocity_m_s", 0.01, slow, 1e-5)]
 WORLDS = (
     *nothing((2, PERIODS, RADAR.sweep_samples), signal),
@@ -103,4 +106,7 @@ def entries() -> list[Entry]:
         "SpectrumCorrelation": SpectrumCorrelation(RADAR),
         "RadialMotion": RadialMotion(RADAR),
     }
-    return [*(Entry(f"compensate.{name}", stage, WORLDS, JUDGED) for name, stage in stages.items())]
+    return [*(Entry(f"{name}", stage, WORLDS, JUDGED) for name, stage in stages.items())]
+
+
+BENCH = Bench("radial", "radial motion seen by a triangular ladar", entries)

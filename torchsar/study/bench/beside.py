@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -22,11 +24,12 @@ from torchsar.scene import (
     VibrationSpectrum,
 )
 
+# settings of the scenes and methods, by choice
 RADAR = InverseRadar(9.6e9, 300e6, 140.0)
 PULSES, CELLS = 1024, 96
 FLIGHT = Flight(StraightPath((-290.0, -55.0, 75.0), (0.0, 15.0, 0.0)), Sway(x=[Sinusoid(0.5, 0.2)]))
 POINTS = RandomPoints(80, 100.0, 24.0)
-STRIP = {"azimuth_m": 60.0, "range_m": 26.0, "beam_deg": 6.0}
+STRIP: dict[str, Any] = {"azimuth_m": 60.0, "range_m": 26.0, "beam_deg": 6.0}
 
 
 def strips(

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+# speed of light in m/s
 C = 299_792_458.0
 F64 = torch.float64
 _BLOCK = 1 << 17  # samples times scatterers that are computed at once

@@ -75,8 +75,9 @@ class Turntable:
         """Pulses without noise, (pulse, range) complex128."""
         time = torch.arange(self.pulses, dtype=F64)[:, None] / self.prf_hz
         terms = (1.0, *k)
-        angle = omega_rad_s * sum(c * time ** (i + 1) / math.factorial(i + 1) for i, c in enumerate(terms))
-        rate = omega_rad_s * sum(c * time**i / math.factorial(i) for i, c in enumerate(terms))
+        zero = torch.zeros_like(time)
+        angle = omega_rad_s * sum((c * time ** (i + 1) / math.factorial(i + 1) for i, c in enumerate(terms)), zero)
+        rate = omega_rad_s * sum((c * time**i / math.factorial(i) for i, c in enumerate(terms)), zero)
         moved = x * torch.sin(angle) - 2 * (y + yc_m) * torch.sin(angle / 2).square()
         velocity = rate * (x * torch.cos(angle) - (y + yc_m) * torch.sin(angle))
         history = torch.polar(torch.ones_like(moved), -4 * math.pi / self.wavelength_m * moved) * amplitude
@@ -106,6 +107,7 @@ class Turntable:
         ), std
 
 
+# settings of the scenes and methods, by choice
 SMALL = Turntable(125e3, 2500, 64, 0.12, 120, 1.6)
 MID = Turntable(500e3, 10000, 32, 0.24, 300, 6.43)
 

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+# speed of light in m/s
 C = 299_792_458.0
 F64 = torch.float64
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+# speed of light in m/s
 C = 299_792_458.0
 
 

@@ -9,9 +9,6 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from tests.audit.frame import SNR_DB, Batch, Entry, Quantity, World, nothing
-from tests.compensate.turning import points
-from tests.direct.turntable import Turntable
 from torchsar.compensate import (
     CoarseRotation,
     CorrectPulsePhase,
@@ -25,6 +22,9 @@ from torchsar.echo import simulate_turntable
 from torchsar.radar import LIGHT_M_S, InverseRadar
 from torchsar.radar.warp import warp
 from torchsar.scene import Aircraft, PolynomialRotation, Satellite, TurntableWorld, UniformStartPhase
+from torchsar.study.bench.direct.turntable import Turntable
+from torchsar.study.bench.frame import SNR_DB, Batch, Bench, Entry, Quantity, World
+from torchsar.study.bench.nothing import nothing
 
 F64 = torch.float64
 WIDTH_M, DEPTH_M = 0.6, 5.2  # of targets; their Doppler fills 90 % of the band at the end
@@ -38,6 +38,13 @@ ORDER = EntropyObjective(order=3, range_term=False, oversampling=2.0)
 def signal(x: Tensor) -> Signal:
     """Pulses with the axes of the radar, in single precision."""
     return Signal(x.to(torch.complex64), RADAR.raw_axes(*x.shape[-2:]))
+
+
+def points(seed: int = 0, count: int = 30) -> tuple[Tensor, Tensor, Tensor]:
+    """Cross range over 0.6 m, range over 5.6 m, complex amplitudes of 0.5 to 1.5."""
+    source = torch.Generator().manual_seed(seed)
+    x, y, level, phase = (torch.rand(count, generator=source, dtype=F64) for _ in range(4))
+    return 0.6 * (x - 0.5), 5.6 * (y - 0.5), torch.polar(0.5 + level, 2 * math.pi * phase)
 
 
 def truth_of(trials: int, **more: Tensor) -> dict[str, Tensor]:
@@ -126,6 +133,7 @@ def off_the_warp(found: Tensor, truth: Tensor) -> Tensor:
     return torch.angle(flat * flat.mean(-1, keepdim=True).conj()).square().mean(-1).sqrt()
 
 
+# tolerances of use
 WARP = [Quantity("warp_k", 0.5, warp_error, predicted=False)]
 PARTS = [Quantity("k1_per_s", 4.0, floor=0.01), Quantity("k2_per_s2", 400.0, floor=1.0)]
 RATE = [Quantity("omega_rad_s", 0.1 * OMEGA, floor=1e-6)]
@@ -143,6 +151,7 @@ WORLDS = (
     World("direct", direct(0.0), 0.0),
     World("direct", direct(-10.0), -10.0),
 )
+# settings of the scenes and methods, by choice
 PHASE_WORLDS = (
     *nothing(
         (TABLE.pulses, TABLE.cells),
@@ -173,11 +182,14 @@ def entries() -> list[Entry]:
     phase = Turn(RotationAutofocus(RADAR), CorrectPulsePhase())
     pair = Alternate(3, phase=phase, rotation=Turn(CoarseRotation(RADAR, yc_m=0.0, fits=4)))
     return [
-        Entry("compensate.UnevenRotation", UnevenRotation(RADAR), WORLDS, [*PARTS, *WARP, *RATE]),
-        Entry("compensate.CoarseRotation", CoarseRotation(RADAR), WORLDS, WARP),
-        Entry("compensate.CoarseRotation:fits", CoarseRotation(RADAR, fits=4), WORLDS, WARP),
-        *(Entry(f"compensate.{name}", stage, WORLDS, WARP) for name, stage in searches.items()),
-        Entry("compensate.EntropyRotation:far", far, [world for world in WORLDS if world.name == "direct"], WARP),
-        Entry("compensate.RotationAutofocus", RotationAutofocus(RADAR), PHASE_WORLDS, PHASES_OF_WARP),
-        Entry("core.Alternate", lambda x, **_: pair(x), PHASE_WORLDS, [*PHASES_OF_WARP, *WARP]),
+        Entry("UnevenRotation", UnevenRotation(RADAR), WORLDS, [*PARTS, *WARP, *RATE]),
+        Entry("CoarseRotation", CoarseRotation(RADAR), WORLDS, WARP),
+        Entry("CoarseRotation:fits", CoarseRotation(RADAR, fits=4), WORLDS, WARP),
+        *(Entry(f"{name}", stage, WORLDS, WARP) for name, stage in searches.items()),
+        Entry("EntropyRotation:far", far, [world for world in WORLDS if world.name == "direct"], WARP),
+        Entry("RotationAutofocus", RotationAutofocus(RADAR), PHASE_WORLDS, PHASES_OF_WARP),
+        Entry("Alternate", lambda x, **_: pair(x), PHASE_WORLDS, [*PHASES_OF_WARP, *WARP]),
     ]
+
+
+BENCH = Bench("rotation", "a rotation that is not uniform", entries)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+# speed of light in m/s
 C = 299_792_458.0
 
 

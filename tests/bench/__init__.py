@@ -1,0 +1,1 @@
+"""Benchmarks: every estimator is in one, records meet their bars, and scores cannot be gamed."""

@@ -1,0 +1,248 @@
+"""Scores repeat, methods of all kinds are entered, and cheats are exposed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from torchsar.cli import main
+from torchsar.compensate import Sca, autofocus, sharpest_phase
+from torchsar.core import Estimate
+from torchsar.study.bench import entrant, frame, methods, records, show
+from torchsar.study.bench.frame import Bench, Entry, World, scored
+
+WORLDS = methods.WORLDS
+SOME = [w for w in WORLDS if w.label in ("noise", "direct, 10 dB", "clutter 60 %, 5 dB", "lost pulses, 10 dB")]
+
+
+def few(run: Callable[..., Any], worlds: list[World] = SOME, name: str = "mine", **options: Any) -> dict[str, Any]:
+    """Rows of one method."""
+    run = entrant.entrant(run, "phase_rad", per_pulse=True)
+    found = scored(methods.BENCH, [Entry(name, run, worlds, methods.PHASES)], 6, **options)
+    return found[name]
+
+
+def without_time(rows: Any) -> Any:
+    """Rows without what differs from run to run."""
+    if isinstance(rows, dict):
+        return {key: without_time(value) for key, value in rows.items() if key not in ("pairs", "memory")}
+    return rows
+
+
+def numbers(rows: Any) -> list[float]:
+    """All numbers of rows."""
+    if isinstance(rows, dict | list):
+        return [x for value in (rows.values() if isinstance(rows, dict) else rows) for x in numbers(value)]
+    return [] if rows is None else [float(rows)]
+
+
+def test_scores_repeat_to_the_bit_and_hardly_depend_on_batches_and_threads() -> None:
+    first = without_time(few(Sca()))
+    assert first == without_time(few(Sca()))
+    assert np.allclose(numbers(first), numbers(without_time(few(Sca(), batch=4))), rtol=1e-5, atol=1e-5)
+    before, one = torch.get_num_threads(), SOME[1:2]
+    first = without_time(few(Sca(), one))
+    torch.set_num_threads(3 - min(before, 2))
+    try:
+        again = without_time(few(Sca(), one))
+    finally:
+        torch.set_num_threads(before)
+    assert np.allclose(numbers(first), numbers(again), rtol=1e-5, atol=1e-5)
+
+
+def test_trials_of_a_world_do_not_depend_on_their_number() -> None:
+    for world in WORLDS:
+        (few_trials,), (more,) = world.blocks(1), world.blocks(2)
+        assert torch.allclose(few_trials.data.data[0], more.data.data[0], atol=1e-4), world.label
+
+
+def test_splits_and_draws_are_other_scenes() -> None:
+    world = SOME[1]
+    parts = [world.blocks(1), world.blocks(1, "validation"), world.blocks(1, "train"), world.blocks(1, draw=1)]
+    assert len({float(part[0].data.data.abs().sum()) for part in parts}) == 4
+
+
+def of_lags(x: Any) -> Any:
+    """Phases from products of adjacent pulses, for tensors and arrays alike."""
+    steps = (x[:, 1:] * x[:, :-1].conj()).sum(-1)
+    if isinstance(x, np.ndarray):
+        return np.concatenate([np.zeros((len(x), 1)), np.angle(steps).cumsum(-1)], -1)
+    return torch.cat([torch.zeros(len(x), 1), steps.angle().cumsum(-1)], -1)
+
+
+class Lags(nn.Module):
+    """The same as a module."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return of_lags(x)
+
+
+def only_arrays(x: Any) -> Any:
+    """The same for arrays alone."""
+    return of_lags(np.ascontiguousarray(x.astype(np.complex128)))
+
+
+def test_modules_classes_functions_and_arrays_score_alike() -> None:
+    rows = [without_time(few(method)) for method in (of_lags, Lags, Lags(), only_arrays)]
+    for other in rows[1:]:
+        assert np.allclose(numbers(other), numbers(rows[0]), rtol=1e-3, atol=1e-4)
+
+
+def test_a_method_may_give_its_deviation_and_its_verdict() -> None:
+    def honest(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        found = autofocus(x)
+        return found["phase_rad"], found.std["phase_rad"], found.ok
+
+    assert without_time(few(honest)) == without_time(few(autofocus))
+    silent = few(lambda x: (autofocus(x)["phase_rad"], None, None))
+    assert silent["all"]["ok"][0] == 1 and silent["all"]["calibration"] is None
+
+
+def test_a_wrong_shape_is_one_sentence() -> None:
+    with pytest.raises(entrant.MethodError, match=r"real values phase_rad of shape \(6, 128\).*got torch.complex64"):
+        few(lambda x: x.mean(-1))
+    with pytest.raises(entrant.MethodError, match="class, module or function, got int"):
+        entrant.entrant(3, "phase_rad")
+
+
+def test_values_that_are_not_finite_are_no_results() -> None:
+    rows = few(lambda x: torch.full(x.shape[:-1], torch.nan))
+    assert rows["all"]["ok"][0] == 0 and rows["all"]["merit"][0] == 0
+
+
+def test_a_method_cannot_change_the_data() -> None:
+    def spoils(x: Tensor) -> Tensor:
+        x.zero_()
+        return torch.zeros(x.shape[:-1])
+
+    entries = [
+        Entry(name, entrant.entrant(f, "phase_rad", True), SOME, methods.PHASES)
+        for name, f in (("a", spoils), ("b", of_lags))
+    ]
+    found = scored(methods.BENCH, entries, 6)
+    assert without_time(found["b"]) == without_time(few(of_lags))
+
+
+# Three methods that seem good by one figure alone.
+
+
+def statistics(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Phases of the statistics of the truth, with their own standard deviation."""
+    draws = torch.Generator().manual_seed(1)
+    phase = 2 * torch.pi * torch.rand(x.shape[:-1], generator=draws)
+    return phase, torch.full_like(phase, 2.5), torch.ones(len(x), dtype=torch.bool)
+
+
+def sharpest(x: Tensor) -> Tensor:
+    """The image of least entropy, whatever its pulses are."""
+    return sharpest_phase(x, steps=60, assess=False)["phase_rad"]
+
+
+def always_ok(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Good phases, of which all are said to be right."""
+    found = autofocus(x)
+    return found["phase_rad"], found.std["phase_rad"], torch.ones(len(x), dtype=torch.bool)
+
+
+def test_cheats_are_exposed() -> None:
+    honest = few(autofocus)["all"]
+    assert honest["sure_wrong"][0] == 0 and honest["merit"][0] > 0.4
+    # its errors are within its deviation, but none of its images is right
+    drawn = few(statistics)
+    assert 0.5 < drawn["all"]["calibration"] < 2
+    assert drawn["all"]["right"][0] == 0 and drawn["all"]["sure_wrong"][0] == 1 and drawn["all"]["merit"][0] == -1
+    # its images are sharper than the true ones, also where they are wrong, and of noise
+    sharp = few(sharpest, [*SOME, *(w for w in WORLDS if w.label == "vehicle 5 dB, 10 dB")])
+    vehicle = sharp["worlds"]["vehicle 5 dB, 10 dB"]
+    assert vehicle["entropy_excess_nats"][0] < -0.5 and vehicle["sharper_wrong"][0] == 1
+    assert vehicle["sure_wrong"][0] == sharp["worlds"]["noise"]["sure_wrong"][0] == 1
+    # it has the values of the honest method, and loses by its verdicts alone
+    sure = few(always_ok)["all"]
+    assert sure["error"] == honest["error"] and sure["right"] == honest["right"]
+    assert sure["sure_wrong"][0] > 0.3 and sure["merit"][0] < honest["merit"][0] - 0.3
+    assert [x["merit"][0] for x in (honest, sure, sharp["all"], drawn["all"])] == sorted(
+        (x["merit"][0] for x in (honest, sure, sharp["all"], drawn["all"])), reverse=True
+    )
+
+
+def test_a_refusal_is_named() -> None:
+    def refuses(x: Tensor) -> Estimate:
+        raise ValueError("not for me")
+
+    rows = few(refuses)
+    assert rows["worlds"]["noise"]["refused"] == "not for me" and rows["all"]["ok"][0] == 0
+
+
+@pytest.fixture
+def three(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The benchmark with few worlds."""
+    entries = [replace(entry, worlds=SOME) for entry in methods.entries() if entry.name in ("sca", "uncorrected")]
+    small = Bench("autofocus", "phases", lambda: entries, methods.scores, per_pulse=True)
+    monkeypatch.setattr(records, "bench", lambda name: small)
+
+
+@pytest.mark.usefixtures("three")
+def test_the_command_scores_beside_records(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my_methods.py").write_text("import numpy as np\n\n\ndef zero(x):\n    return np.zeros(x.shape[:-1])\n")
+    out = [word for name in ("mine.json", "mine.tex", "mine.pdf", "mine.txt") for word in ("--out", name)]
+    assert main(["bench", "autofocus", "my_methods:zero", "sca", "--trials", "6", *out]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("torchsar bench autofocus, version 2026.1, checksum ")
+    assert [line.split()[0] for line in lines[1:]] == ["method", "sca", "my_methods:zero"]
+    record = json.loads((tmp_path / "mine.json").read_text())
+    assert set(record["methods"]) == {"sca", "my_methods:zero"} and record["version"] == records.VERSION
+    assert record["checksum"] in (tmp_path / "mine.tex").read_text()
+    assert r"\begin{tabular}" in (tmp_path / "mine.tex").read_text()
+    assert (tmp_path / "mine.pdf").read_bytes().startswith(b"%PDF")
+    assert main(["bench", "autofocus", "mine.json", "recorded"]) == 0
+    both = [line.split()[0] for line in capsys.readouterr().out.splitlines()[2:]]
+    assert {"my_methods:zero", "autofocus", "textbook_pga"} <= set(both)
+
+
+@pytest.mark.usefixtures("three")
+@pytest.mark.parametrize(
+    "words, sentence",
+    [
+        (["nobody"], "'nobody' is no method of autofocus: give package.module:Name, or one of sca, uncorrected"),
+        (["os.path:nothing"], "the method 'os.path:nothing' cannot be imported"),
+        (["other.json"], "other.json is not a record of torchsar bench"),
+        (["old.json"], "old.json is a record of version"),
+        (["sca", "--out", "mine.doc"], "--out mine.doc: the name must end in .json"),
+        (["recorded", "small.json"], "records of other scenes cannot be compared"),
+    ],
+)
+def test_mistakes_get_one_sentence(
+    words: list[str], sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    whole = records.recorded("autofocus")
+    (tmp_path / "other.json").write_text("{}")
+    (tmp_path / "old.json").write_text(json.dumps({**whole, "version": "2025.1"}))
+    (tmp_path / "small.json").write_text(json.dumps({**whole, "small": True}))
+    assert main(["bench", "autofocus", *words, "--trials", "6"]) == 2
+    assert sentence in capsys.readouterr().err
+
+
+def test_an_unknown_benchmark_gets_one_sentence(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "weather"]) == 2
+    assert "there is no benchmark 'weather'; choose one of autofocus, alignment, doppler" in capsys.readouterr().err
+
+
+def test_other_benchmarks_take_methods_of_users() -> None:
+    one = records.bench("doppler")
+    first = one.entries()[0]
+    world = next(w for w in first.worlds if w.label == "own, 10 dB")
+    run = entrant.entrant(lambda x: np.zeros(len(x)), "doppler_hz")
+    rows = scored(one, [frame.in_worlds_of(replace(first, worlds=[world]), "zero", run)], 6)["zero"]
+    assert 5 < rows["all"]["error"][0] < 60 and show.cells({"methods": {"zero": rows}})[0][0] == "method"

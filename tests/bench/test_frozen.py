@@ -1,0 +1,60 @@
+"""Scenes and scores are frozen by their version."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+import torch
+
+from torchsar.study.bench import records
+from torchsar.study.bench.records import HERE, PLACES, VERSION, bench, checksum, frozen
+
+# checksum of each benchmark in each version: a changed scene or score needs another version
+VERSIONS = {
+    "2026.1": {
+        "autofocus": "b68d99982081",
+        "alignment": "31b3dc061dd8",
+        "doppler": "f37d8ca9dfb7",
+        "velocity": "4d35cc4596b8",
+        "radial": "b0b91b789f43",
+        "rotation": "d06ea4491fa6",
+        "repair": "14cbcc11ddfb",
+        "channels": "70c77c8adc13",
+        "path": "daf62b495961",
+    }
+}
+SLOW = ("velocity", "repair", "channels")  # their scenes take seconds
+NAMES = [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in PLACES]
+
+
+def test_the_version_has_the_checksums_that_were_published() -> None:
+    assert {name: checksum(name) for name in PLACES} == VERSIONS[VERSION], (
+        "scenes or scores have changed: give records.VERSION another name, and make the records again"
+    )
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_scenes_and_scores_are_those_of_the_version(name: str) -> None:
+    table = json.loads((HERE / "frozen.json").read_text(encoding="utf-8"))[name]
+    found = frozen(bench(name))
+    assert set(found["worlds"]) == set(table["worlds"])
+    for world, numbers in found["worlds"].items():
+        assert near(numbers, table["worlds"][world]), (world, numbers, table["worlds"][world])
+    assert set(found["score"]) == set(table["score"])
+    assert all(near(value, table["score"][key]) for key, value in found["score"].items()), found["score"]
+
+
+def near(found: Any, recorded: Any) -> bool:
+    """Whether numbers are equal but for the rounding of another machine."""
+    if isinstance(found, list):
+        return len(found) == len(recorded) and all(map(near, found, recorded))
+    return found == recorded or abs(found - recorded) <= 1e-3 * max(1, abs(recorded))
+
+
+def test_a_changed_scene_changes_the_fingerprint() -> None:
+    world = next(w for w in bench("autofocus").entries()[0].worlds if w.label == "direct, 10 dB")
+    x = world.blocks(1)[0].data.data
+    assert not near(records.fingerprint(x), records.fingerprint(x + 0.02 * x.abs().mean() * torch.randn(x.shape)))
+    assert not near(records.fingerprint(x), records.fingerprint(x.flip(-1)))

@@ -1,0 +1,1 @@
+"""Generators of data that are independent of the simulators of the package."""

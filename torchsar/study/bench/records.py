@@ -1,0 +1,217 @@
+"""Records of benchmarks: their version, the frozen scenes, and files to hand in."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import json
+import math
+import platform
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import torchsar
+from torchsar.core import Estimate, Outcome
+from torchsar.study.bench.entrant import entrant, loaded
+from torchsar.study.bench.frame import BLOCK, Batch, Bench, Entry, counted, in_worlds_of, row, samples, scored
+from torchsar.study.settings.errors import ConfigError
+
+VERSION = "2026.1"
+HERE = Path(__file__).parent
+# where the benchmarks are
+PLACES = {
+    "autofocus": "methods:BENCH",
+    "alignment": "profiles:BENCH",
+    "doppler": "strips:BENCH",
+    "velocity": "channels:VELOCITY",
+    "radial": "ladars:BENCH",
+    "rotation": "rotations:BENCH",
+    "repair": "repairs:BENCH",
+    "channels": "channels:BENCH",
+    "path": "paths:BENCH",
+}
+Record = dict[str, Any]
+
+
+def bench(name: str) -> Bench:
+    """The benchmark of a name."""
+    if name not in PLACES:
+        raise ConfigError(f"there is no benchmark {name!r}; choose one of {', '.join(PLACES)}")
+    module, _, place = PLACES[name].partition(":")
+    return getattr(importlib.import_module(f"torchsar.study.bench.{module}"), place)
+
+
+def fingerprint(x: Tensor) -> list[float]:
+    """Three numbers of samples: their rms, and a projection on fixed phasors relative to it."""
+    flat = x.detach().to(torch.complex128).reshape(-1)
+    flat = torch.where(torch.isfinite(flat.abs()), flat, 0)
+    k = torch.arange(len(flat), dtype=torch.float64)
+    norm = float(torch.linalg.vector_norm(flat))
+    part = complex((flat * torch.polar(torch.ones_like(k), 1.618 * k.square() % (2 * math.pi))).sum())
+    three = norm / max(1, len(flat)) ** 0.5, part.real / (norm or 1), part.imag / (norm or 1)
+    return [float(f"{y:.6g}") for y in three]
+
+
+def frozen(one: Bench) -> dict[str, Any]:
+    """What the version of a benchmark fixes: first data and truth of each world, and a score."""
+    found: dict[str, Any] = {}
+    seen: set[int] = set()
+    for entry in one.entries():
+        for world in entry.worlds:
+            if id(world) in seen:
+                continue
+            seen.add(id(world))
+            batch = world.blocks(1)[0]
+            truth = [fingerprint(x) for _, x in sorted((batch.truth or {}).items())]
+            label = f"{entry.name}: {world.label}" if world.label in found else world.label
+            found[label] = [fingerprint(samples(batch.data)), *truth]
+    return {"worlds": found, "score": _example(one)}
+
+
+def _example(one: Bench) -> dict[str, Any]:
+    """Scores of an estimate near the truth, sure in every second trial."""
+    entry = one.entries()[0]
+    for world in entry.worlds:
+        batch: Batch = world.blocks(4)[0]
+        if batch.truth is not None:
+            break
+    value, std = {}, {}
+    for quantity in (q for q in entry.judged if q.name in (batch.truth or {})):
+        truth = (batch.truth or {})[quantity.name].double().nan_to_num()
+        wave = torch.cos(torch.arange(truth.numel(), dtype=torch.float64).square()).reshape(truth.shape)
+        value[quantity.name] = truth + 0.7 * quantity.tolerance * wave
+        std[quantity.name] = torch.full_like(truth, 0.5 * quantity.tolerance)
+    ok = torch.arange(4) % 2 == 0
+    found = Estimate(value, std, outcome=Outcome.of(ok, Outcome.INEXACT), quality=ok.double())
+    return row(counted(entry, batch, found, one.scores))
+
+
+def checksum(name: str) -> str:
+    """The beginning of the SHA-256 of what is frozen of a benchmark."""
+    table = json.loads((HERE / "frozen.json").read_text(encoding="utf-8"))[name]
+    return hashlib.sha256(json.dumps(table, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def score(
+    name: str,
+    methods: Mapping[str, Any] | None = None,
+    *,
+    trials: int = 20,
+    small: bool = False,
+    draw: int = 0,
+    batch: int = BLOCK,
+    say: Callable[[str, int], object] = lambda *_: None,
+) -> Record:
+    """Score methods on a benchmark.
+
+    Args:
+        name: Name of the benchmark.
+        methods: Classes, modules or functions by name, see `entrant`; all built-in ones by default.
+            None in place of one means the built-in one of this name. A name "BUILT-IN=mine" takes
+            the worlds of a built-in method, and not those of the first one.
+        trials: Number of trials in a world.
+        small: Whether to try every fourth world only, with at most 6 trials.
+        draw: Number of other scenes than the frozen ones, from 1 on.
+        batch: Largest number of trials that a method is given at once.
+        say: Function that is told each world before it is tried, and their number.
+
+    Returns:
+        The record, which JSON can hold.
+    """
+    one = bench(name)
+    known = {entry.name: entry for entry in one.entries()}
+    first = next(iter(known.values()))
+    entries: list[Entry] = []
+    for label, method in (dict.fromkeys(known) if methods is None else methods).items():
+        if method is None and label not in known:
+            told = f"give package.module:Name, or one of {', '.join(known)}"
+            raise ConfigError(f"{label!r} is no method of {name}: {told}")
+        if method is None:
+            entries.append(known[label])
+        else:
+            like = known.get(label.partition("=")[0], first)
+            entries.append(in_worlds_of(like, label, entrant(method, like.judged[0].name, one.per_pulse)))
+    found = scored(one, entries, trials, small=small, draw=draw, batch=batch, say=say)
+    return {
+        "bench": name,
+        "version": VERSION,
+        "checksum": checksum(name),
+        "trials": trials,
+        "small": small,
+        "draw": draw,
+        "made": {
+            "torchsar-lab": torchsar.__version__,
+            "torch": torch.__version__,
+            "numpy": np.__version__,
+            "machine": f"{platform.system()} {platform.machine()}",
+            "threads": torch.get_num_threads(),
+        },
+        "methods": found,
+    }
+
+
+def recorded(name: str) -> Record:
+    """The record of the package."""
+    return read(HERE / "recorded" / f"{name}.json")
+
+
+def read(path: Path) -> Record:
+    """Read a record.
+
+    Raises:
+        ConfigError: If the file is none, or of another version.
+    """
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        version, mine = (record["version"], record["checksum"]), (VERSION, checksum(record["bench"]))
+    except (ValueError, KeyError, TypeError) as error:
+        raise ConfigError(f"{path} is not a record of torchsar bench") from error
+    if version != mine:
+        raise ConfigError(f"{path} is a record of version {version}, and this program measures {mine}; score again")
+    return record
+
+
+def together(records: Sequence[Record]) -> Record:
+    """Join the methods of records, of which the later ones replace methods of the same name."""
+    keys = ("bench", "small", "draw")
+    for other in records[1:]:
+        if any(other[key] != records[0][key] for key in keys):
+            told = [{key: record[key] for key in keys} for record in (records[0], other)]
+            raise ConfigError(f"records of other scenes cannot be compared: {told[0]} and {told[1]}")
+    methods = {name: method for record in records for name, method in record["methods"].items()}
+    return {**records[0], "methods": methods}
+
+
+def write(path: Path, record: Record) -> None:
+    """Write a record, one row per line, whole or not at all."""
+    methods = ",\n".join(f"{json.dumps(name)}: {_method(method)}" for name, method in record["methods"].items())
+    head = json.dumps({**record, "methods": None})
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(f"{path.name}.part")
+    beside.write_text(head.replace('"methods": null', f'"methods": {{\n{methods}\n}}') + "\n", encoding="utf-8")
+    beside.replace(path)
+
+
+def _method(method: Mapping[str, Any]) -> str:
+    rest = json.dumps({key: value for key, value in method.items() if key != "worlds"})
+    rows = ",\n".join(f"  {json.dumps(world)}: {json.dumps(numbers)}" for world, numbers in method["worlds"].items())
+    return f'{rest[:-1]}, "worlds": {{\n{rows}}}}}'
+
+
+def methods_of(words: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
+    """Divide words of the command line into methods by name and names of records."""
+    files = [word for word in words if word == "recorded" or word.endswith(".json")]
+    rest = [word for word in words if word not in files]
+    # a setting of a built-in method has a colon, too, but no dot before it
+    theirs = {word: loaded(place) if _is_place(place := word.rpartition("=")[2]) else None for word in rest}
+    return theirs, files
+
+
+def _is_place(word: str) -> bool:
+    module, colon, _ = word.partition(":")
+    return "." in module or (bool(colon) and (Path.cwd() / f"{module}.py").is_file())
