@@ -127,6 +127,15 @@ def test_recorded_block_is_read(recorded):
     assert recording.radar.pulse_samples == 1350  # of 1349.2 sample intervals, the first at its leading edge
 
 
+@pytest.mark.parametrize("dwell_s", [None, 0.7])
+def test_the_dwell_of_the_beam_is_optional(tmp_path, dwell_s):
+    path, _ = archive(tmp_path, integration_s=dwell_s)
+    assert read_stripmap(path).radar.integration_s == dwell_s
+    path, _ = archive(tmp_path, integration_s=-1.0)
+    with pytest.raises(ValueError, match="integration_s must be one positive number, got -1"):
+        read_stripmap(path)
+
+
 @pytest.mark.parametrize(
     ("key", "factor", "said"),
     [

@@ -73,6 +73,7 @@ def read_stripmap(path: str | Path, dtype: torch.dtype = torch.complex64, regula
       subtracted, such as 127.5 of bytes without sign.
     - `first_cell`: range cell of the first sample, counted from 1, by default 1.
     - `c_m_s`: speed of light.
+    - `integration_s`: time that a target stays in the beam; otherwise it counts as unknown.
     - `agc_db` (line,): attenuation of the receiver in dB, which is compensated here.
     - `line_number` (line,), which jumps where lines were lost, and `line_time_s` (line,), the times
       of the pulses. `prf_hz` and `slant_range_cell1_m` may have one number per line, too, where the
@@ -140,6 +141,7 @@ def describe_stripmap(fields: Mapping[str, StoredArray], path: Path) -> Describe
             raise ValueError(f"{fields[key].what} must be positive numbers, got a least one of {float(values.min()):g}")
     numbers |= {key: float(x.median() if key == "prf_hz" else x.min()) for key, x in per_line.items()}
     c = number(fields["c_m_s"]) if "c_m_s" in fields else LIGHT_M_S
+    dwell = number(fields["integration_s"], "positive number") if "integration_s" in fields else None
     first = number(fields["first_cell"], "whole number") if "first_cell" in fields else 1
     iq = fields["iq"]
     real = len(iq.shape) == 3 and iq.shape[-1] == 2 and iq.dtype.kind in "iuf"
@@ -159,6 +161,7 @@ def describe_stripmap(fields: Mapping[str, StoredArray], path: Path) -> Describe
             velocity_m_s=numbers["v_eff_m_s"],
             near_range_m=numbers["slant_range_cell1_m"] + (int(first) - 1) * c / (2 * fs),
             wave_speed_m_s=c,
+            integration_s=dwell,
         )
         aux: dict[str, Any] = {name: _side(fields[name], name, iq) for name in _AUX if name in fields}
         if "prf_hz" in per_line:

@@ -55,7 +55,7 @@ _KINDS = {
         ("pulse", "range"),
         {
             **{"fs_hz": "Hz", "prf_hz": "Hz", "f0_hz": "Hz", "chirp_rate_hz_s": "Hz/s", "pulse_s": "s"},
-            **{"slant_range_cell1_m": "m", "v_eff_m_s": "m/s", "first_cell": "", "c_m_s": "m/s"},
+            **{"slant_range_cell1_m": "m", "v_eff_m_s": "m/s", "first_cell": "", "c_m_s": "m/s", "integration_s": "s"},
         },
         {
             **{"agc_db": ("dB", "pulse"), "line_number": ("", "pulse"), "line_time_s": ("s", "pulse")},
