@@ -211,8 +211,9 @@ def _lines(
     spectrum = torch.fft.fftshift(radar.pulse.spectrum(n_fft, radar.sampling_hz, placed.closest_m.device)).to(dtype)
     lines = []
     slow_s = torch.arange(n_pulse, dtype=torch.float64, device=placed.closest_m.device) / radar.prf_hz
-    many = summed_by_transform(placed.closest_m, n_fft)
-    row = row_bytes(placed.closest_m.shape[-1], n_fft, dtype) if many else 8 * n_fft
+    count = placed.closest_m.shape[-1]
+    many = summed_by_transform(count, n_fft, slow_s.device)
+    row = row_bytes(count, n_fft, dtype) if many else 8 * n_fft
     for pulses in blocks(n_pulse, row, _TABLE_BYTES, 64):
         block = _block_spectrum(placed, world, radar, slow_s[pulses], n_fft, dtype)
         lines.append(torch.fft.ifft(torch.fft.ifftshift(block * spectrum, dim=-1))[..., :n_range])
@@ -227,8 +228,8 @@ def _block_spectrum(
     doppler = per_trial(_true_doppler(world, radar), 2, pulse_s)
     total = torch.zeros((*placed.closest_m.shape[:-1], pulse_s.numel(), n_fft), dtype=dtype, device=pulse_s.device)
     count = placed.closest_m.shape[-1]
-    many = summed_by_transform(placed.closest_m, n_fft)
-    each = row_bytes(1, 0, dtype) if many else 8 * 3 * math.isqrt(n_fft)
+    many = summed_by_transform(count, n_fft, pulse_s.device)
+    each = 25 * dtype.itemsize if many else 8 * 3 * math.isqrt(n_fft)
     width = max(16, _TABLE_BYTES // (pulse_s.numel() * each))
     for first in range(0, count, width):
         some = placed.chosen((..., None, slice(first, first + width)))

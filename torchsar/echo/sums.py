@@ -50,7 +50,7 @@ def line_tables(turns: Tensor, n: int, first: float, dtype: torch.dtype) -> tupl
     return linear_phasor(m * turns, first / m, -(-n // m), dtype), linear_phasor(turns, 0, m, dtype)
 
 
-def summed_by_transform(turns: Tensor, n: int, few: int = 64) -> bool:
+def summed_by_transform(targets: int, n: int, device: torch.device | None = None, few: int = 64) -> bool:
     """Decide whether sums over targets are computed by a non-uniform FFT.
 
     On a processor it is as fast as the matrix product at 20 to 30 targets, and at 4,096 targets
@@ -58,18 +58,19 @@ def summed_by_transform(turns: Tensor, n: int, few: int = 64) -> bool:
     crossing was not measured, always use the matrix product.
 
     Args:
-        turns: Cycles per step, shape (..., target).
+        targets: Number of targets.
         n: Number of steps.
+        device: Device of the sum, None for a processor.
         few: Largest number of targets, and of steps, for the matrix product.
 
     Returns:
         True for the non-uniform FFT.
     """
-    return turns.device.type == "cpu" and min(turns.shape[-1], n) > few
+    return (device is None or device.type == "cpu") and min(targets, n) > few
 
 
 def row_bytes(targets: int, n: int, dtype: torch.dtype) -> int:
-    """Return the size of the tables of a sum by a non-uniform FFT for one row.
+    """Return the size of the tables of a sum over targets for one row on a processor.
 
     Args:
         targets: Number of targets.
@@ -79,7 +80,8 @@ def row_bytes(targets: int, n: int, dtype: torch.dtype) -> int:
     Returns:
         Size in bytes.
     """
-    return dtype.itemsize * (25 * targets + 8 * n)
+    by_transform = summed_by_transform(targets, n)
+    return dtype.itemsize * (25 * targets + 8 * n if by_transform else 4 * targets * (1 + math.isqrt(n)))
 
 
 class LineSum:
@@ -102,7 +104,9 @@ class LineSum:
         self, turns: Tensor, n: int, first: float, dtype: torch.dtype, by_transform: bool | None = None
     ) -> None:
         self.n, self.start = n, None
-        self.by_transform = summed_by_transform(turns, n) if by_transform is None else by_transform
+        self.by_transform = (
+            summed_by_transform(turns.shape[-1], n, turns.device) if by_transform is None else by_transform
+        )
         if self.by_transform:
             self.transform = Nufft(n, 1e-7 if dtype == torch.complex64 else 1e-13, dtype, turns.device)
             self.points = self.transform.points(turns)
