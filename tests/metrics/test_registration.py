@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Axis, Signal
-from torchsar.metrics import error_db, registered_error_db
+from torchsar.metrics import error_db, registered_error_db, registered_errors
 
 F64 = torch.float64
 
@@ -32,6 +32,23 @@ def test_registration_ignores_shift_slope_gain_and_phase() -> None:
     torch.testing.assert_close(registered_error_db(spoilt, image), torch.full((2,), -20.0).double(), rtol=0, atol=0.2)
     zeros = registered_error_db(torch.zeros_like(image), image)
     torch.testing.assert_close(zeros, torch.zeros(2, dtype=torch.float64))
+
+
+def test_errors_of_amplitude_and_of_phase_are_apart() -> None:
+    """Cubic phases over the image leave its amplitudes, and a wrong gain leaves the phases."""
+    made = torch.randn(2, 64, 48, dtype=torch.complex128, generator=torch.Generator().manual_seed(3))
+    bands = [torch.fft.fftfreq(n, dtype=F64).abs() < 0.3 for n in (64, 48)]
+    image = torch.fft.ifft2(torch.fft.fft2(made) * bands[0][:, None] * bands[1])
+    x = torch.linspace(-1, 1, 64, dtype=F64)[:, None]
+    phase = 0.8 * (5 * x**3 - 3 * x) / 2
+    turned = registered_errors(image * torch.exp(1j * phase), image)
+    assert bool((turned["image_error_db"] > -12).all()) and bool((turned["amplitude_error_db"] < -25).all())
+    assert torch.allclose(turned["phase_error_rad"], torch.full((2,), 0.8 / math.sqrt(7)).double(), rtol=0.15)
+    faded = registered_errors(image * (1 + 0.5 * torch.sin(9 * x)), image)
+    torch.testing.assert_close(faded["amplitude_error_db"], faded["image_error_db"], rtol=0, atol=0.1)
+    assert bool((faded["amplitude_error_db"] > -12).all()) and bool((faded["phase_error_rad"] < 0.02).all())
+    unrelated = registered_errors(torch.zeros_like(image), image)
+    assert float(unrelated["amplitude_error_db"][0]) == 0 and float(unrelated["phase_error_rad"][0]) > 1.8
 
 
 def points(places: Tensor, amplitude: Tensor, size: tuple[int, int]) -> Tensor:
@@ -102,7 +119,7 @@ def test_images_of_nothing_and_numbers_that_are_none_are_no_agreement() -> None:
     none = torch.zeros_like(noise)
     for pair in ((noise, none), (none, noise), (none, none)):
         assert registered_error_db(*pair).tolist() == [0.0, 0.0]
-    with pytest.raises(ValueError, match="registered_error_db.*NaN"):
+    with pytest.raises(ValueError, match="registered_errors.*NaN"):
         registered_error_db(noise * torch.nan, noise)
     with pytest.raises(ValueError, match="trials broadcast"):
         registered_error_db(noise.expand(2, 9, 7), noise[:1].expand(3, 9, 7))

@@ -35,6 +35,12 @@ def test_autofocus_corrects_what_navigation_leaves(tmp_path: Path) -> None:
     assert bool((none["path_residual_rms_m"] > 1e-3).all()) and bool((none["image_error_db"] > -12).all())
     assert bool(best["ok"].all()) and bool((best["path_residual_rms_m"] < 3e-4).all())
     assert bool((best["image_error_db"] < -24).all()) and bool((best["position_error_rms_m"] < 0.02).all())
+    assert bool((best["amplitude_error_db"] < best["image_error_db"]).all()) and bool(
+        (best["phase_error_rad"] < 0.1).all()
+    )
+    assert bool((none["amplitude_error_db"] > -12).all()) and bool(
+        (best["irw_azimuth_m"] < none["irw_azimuth_m"]).all()
+    )
 
 
 def test_the_residual_of_a_path_has_no_shift_and_is_that_of_the_truth(tmp_path: Path) -> None:

@@ -733,6 +733,7 @@ FUNCTIONS = [
         "metrics.error_after_gain_db", "image", lambda x: metrics.error_after_gain_db(x, x.roll(1, -1)), 0, joint=True
     ),
     _entry("metrics.registered_error_db", "image", lambda x: metrics.registered_error_db(x, x.roll(1, -1).conj()), 0),
+    _entry("metrics.registered_errors", "image", lambda x: metrics.registered_errors(x, x.roll(1, -1).conj()), 0),
     _entry("metrics.azimuth_response", "row", lambda x: metrics.azimuth_response(x, 1.0), {"peak": 1}),
     _entry(
         "metrics.replica_level",

@@ -6,7 +6,7 @@ to judge                           what to use
 any of these, ending a chain       `Measure`
 sharpness of an image              `entropy`, `contrast`
 image against a reference          `error_db`; with a free gain `error_after_gain_db`, with a shift
-                                   `registered_error_db`; `correlation`
+                                   `registered_error_db`, `registered_errors`; `correlation`
 response of a point                `impulse_response`; in an azimuth profile `azimuth_response`
 false targets of several channels  `replica_level` within `replica_zones`
 phases of pulses                   `phase_rmse`, `residual_phase`, `strehl`; bounds
@@ -46,7 +46,7 @@ from torchsar.metrics.ladar_bounds import (
 from torchsar.metrics.measure import Measure
 from torchsar.metrics.path_bounds import line_of_sight_bound_m
 from torchsar.metrics.phase import phase_rmse, residual_phase, strehl
-from torchsar.metrics.registration import registered_error_db
+from torchsar.metrics.registration import registered_error_db, registered_errors
 from torchsar.metrics.replicas import azimuth_response, replica_level, replica_zones
 from torchsar.metrics.rotation_bounds import rotation_bounds
 
@@ -69,6 +69,7 @@ __all__ = [
     "range_per_sweep_bound_m",
     "reference_doppler_std_hz",
     "registered_error_db",
+    "registered_errors",
     "replica_level",
     "replica_zones",
     "residual_phase",

@@ -309,6 +309,10 @@ class PathAutofocus(_PathEstimator):
     provides = ("line_of_sight_m", "offset_m")
     neutral = {"line_of_sight_m": 0.0, "offset_m": 0.0}
     find = staticmethod(path_autofocus)
+    not_estimated = (
+        "a constant and a linear error of the path, which shift the image, and rotate and stretch it slightly"
+    )
+    """Errors that the estimate does not contain, and about which its outcome says nothing."""
 
     def __init__(
         self, extent_m: float | None = None, height_m: float = 0.0, rounds: int = 6, assess: bool = True

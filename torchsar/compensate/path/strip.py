@@ -174,6 +174,11 @@ class StripAutofocus(_PathEstimator):
     provides = ("line_of_sight_m", "offset_m")
     neutral = {"line_of_sight_m": 0.0, "offset_m": 0.0}
     find = staticmethod(strip_autofocus)
+    not_estimated = (
+        "errors of the path along the track, such as of its speed, which defocus the image where they are large (see "
+        "`requires`), and a constant and a linear term over the strip, which shift and shear the image"
+    )
+    """Errors that the estimate does not contain, and about which its outcome says nothing."""
 
     def __init__(
         self,

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Annotated, Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar import plot
 from torchsar.compensate.pulse_phase.data import without_line
 from torchsar.core import Chain, Recording, Signal, Trace, per_trial
 from torchsar.echo import Impairment, Simulate
@@ -29,7 +27,7 @@ from torchsar.metrics import (
     error_db,
     impulse_response,
     line_of_sight_bound_m,
-    registered_error_db,
+    registered_errors,
     residual_phase,
 )
 from torchsar.radar import AntennaPath, InverseRadar
@@ -55,10 +53,10 @@ from torchsar.study.names.registry import (
     SCENES,
     AntennaMotions,
 )
-from torchsar.study.output.report import Drawn, first_named
 from torchsar.study.systems.isal import estimated_phase, received
+from torchsar.study.systems.path.figures import geometry, images, paths
 from torchsar.study.systems.path.requirements import flight_requirements
-from torchsar.study.trials.batch import IMAGE, Batch, Judged, Metrics, Processed, Result, Trials
+from torchsar.study.trials.batch import IMAGE, Batch, Judged, Metrics, Processed, Trials
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Alternative, Choice, Measured, lit_noise, some_pixels, white_noise
 from torchsar.study.trials.system import Column, Noise, System, World, by_limit
@@ -253,76 +251,8 @@ def _points(
     found |= {f"displacement_{axis}_m": off[..., i] for i, axis in enumerate(IMAGE)}
     shown = AnyPath.target_columns
     targets: dict[str, Metrics] = {name: {key: found[key][:, i] for key in shown} for i, name in enumerate(places)}
-    return targets, outside, _positions(off, at)
-
-
-def _images(result: Result) -> Drawn:
-    """Draw the images of all methods, the ideal one first."""
-    shown = first_named(result.images)
-    caption = (
-        f"The first trial, in dB: 0.1 % of the samples of '{next(iter(shown))}' exceed 0 dB, the same level for all "
-        "methods."
-    )
-    yield "images", "Images by every method", caption, plot.images(shown, 45.0)
-
-
-def _paths(result: Result) -> Drawn:
-    """Draw the deviations of the true path from a straight line, and its remaining errors."""
-    trials = result.first.trials
-    if not trials.truth:  # no errors were added to the recording
-        return
-    time = plot.array(trials.recording.signal.axes[-2].offsets())
-    shown: dict[tuple[str, str], dict[str, np.ndarray]] = {}
-    for name in ("transmitter", "receiver"):
-        if f"true_{name}_m" in trials.truth:
-            place = plot.array(trials.truth[f"true_{name}_m"].reshape(-1, len(time), 3)[0])
-            line = np.stack([time, np.ones_like(time)], -1)
-            bent = place - line @ np.linalg.lstsq(line, place, rcond=None)[0]
-            shown[f"true path of the {name} minus a straight line", "distance (m)"] = dict(zip("xyz", bent.T))
-    shown["error of the line of sight that is left", "error (mm)"] = {
-        name: 1e3 * plot.array(outcome.judged.view[0])
-        for name, outcome in result.first.outcomes.items()
-        if name != "ideal" and not outcome.failed
-    }
-    parts = [
-        {
-            "series": {name: (time, y) for name, y in of.items()},
-            "xlabel": "time (s)",
-            "ylabel": label,
-            "title": title,
-        }
-        for (title, label), of in shown.items()
-    ]
-    caption = (
-        "The first trial. The error of the line of sight is that of half the path over the middle of the scene, "
-        "recorded and corrected minus true, without constant and linear terms, which hardly change the focus."
-    )
-    yield "paths", "Paths", caption, plot.panels(parts)
-
-
-def _geometry(result: Result) -> Drawn:
-    """Draw the paths of the antennas and the imaged area from above, with the line of sight."""
-    stage = last_image(result.bench.chains["recommended"].stages.values())
-    aux = result.first.trials.recording.aux
-    if stage is None or "transmitter_m" not in aux:
-        return
-    antennas = AntennaPath.recorded(aux)
-    antennas = antennas.of_trial((0,) * len(antennas.trials))
-    names = (
-        ("path of the transmitter", "path of the receiver") if len(antennas.places) > 1 else ("path of the antenna",)
-    )
-    ends = (slice(None, None, max(1, n - 1)) for n in stage.grid.counts)
-    corners = plot.array(stage.grid.pixels_m(*ends)[..., :2].reshape(-1, 2))
-    ring = corners[[0, 1, 3, 2, 0]] if len(corners) == 4 else corners
-    flown = {name: plot.array(place[:, :2]) for name, place in zip(names, antennas.places, strict=True)}
-    sight = np.stack([flown[names[0]].mean(0), corners.mean(0)])
-    lines = {**flown, "imaged area": ring, "line of sight": sight}
-    series = {name: (line[:, 0], line[:, 1]) for name, line in lines.items()}
-    caption = (
-        "The first trial from above: paths, the imaged area of the recommended method, and the mean line of sight."
-    )
-    part = {"series": series, "xlabel": "x (m)", "ylabel": "y (m)", "title": "geometry from above"}
-    yield "geometry", "Geometry from above", caption, plot.panels([part])
+    responses = {key: found[key].nanmedian(1).values for key in shown if not key.startswith("displacement")}
+    return targets, outside, {**_positions(off, at), **responses}
 
 
 class AnyPath(System):
@@ -341,10 +271,17 @@ class AnyPath(System):
         "snr": "mean power of the samples of lit pulses over noise variance, dB",
         "entropy": "-sum p ln p, p = |I|^2 / sum |I|^2 over the whole image, nats",
         "contrast": "standard deviation over mean of the intensity |I|^2",
-        "image_error_db": "10 lg of |g I - I0|^2 / |I0|^2 in dB, I0 from the reference method, after the shift, "
-        "rotation and stretch, the linear and small quadratic phase over the image and the complex gain g that fit "
-        "best, which autofocus cannot observe; in `trade`: of the windowed image of white noise seen through the "
-        "antenna, without registration, relative to the direct sum over the same pulses",
+        "amplitude_error_db": "10 lg of |g |I| - |I0||^2 / |I0|^2 in dB, I0 from the reference method, after the "
+        "shift, rotation and stretch and the real gain g that fit best; what is seen in the image",
+        "phase_error_rad": "rms difference of the phases of I and I0, weighted by |I I0|, after the same registration "
+        "and without constant, linear and small quadratic phases over the image; it matters where images are compared "
+        "or added, and autofocus cannot observe slow phases; left out, as the error of the amplitudes, where an image "
+        "differs from the reference by rounding only",
+        "image_error_db": "10 lg of |g I - I0|^2 / |I0|^2 in dB of the complex samples, so that both errors count, "
+        "after the same registration with a complex gain g; in `trade`: of the windowed image of white noise seen "
+        "through the antenna, without registration, relative to the direct sum over the same pulses",
+        "irw_azimuth_m": "median over the named points, as the other figures of responses; each point has its own in "
+        "the tables of targets",
         "path_residual_rms_m": "rms over the pulses of half the path over the middle of the scene, recorded and "
         "corrected minus true, without constant and linear terms; modulo half a wavelength where the path or phases of "
         "pulses are corrected; for a strip over the middle of the strip abeam, and over the pulses that see the image",
@@ -354,13 +291,19 @@ class AnyPath(System):
         "entropy_above_ideal_nats": "entropy minus that of the reference method",
     }
     columns = {
-        "image_error_db": Column("image error against the reference", "dB", drawn="mean"),
-        "path_residual_rms_m": Column("error of the line of sight, rms", "m", drawn="rms"),
+        "amplitude_error_db": Column("error of the amplitudes against the reference", "dB", drawn="mean"),
+        "phase_error_rad": Column("error of the phases of bright pixels, rms", "rad", drawn="rms"),
+        "irw_azimuth_m": Column("width of points in azimuth", "m"),
+        "irw_range_m": Column("width of points in range", "m"),
+        "pslr_azimuth_db": Column("PSLR of points in azimuth", "dB"),
+        "pslr_range_db": Column("PSLR of points in range", "dB"),
         "position_error_rms_m": Column("position error of points, rms", "m"),
         "image_shift_m": Column("common shift of the points", "m"),
         "entropy_nats": Column("entropy", "nats", drawn="mean"),
         "entropy_above_ideal_nats": Column("entropy above the reference", "nats"),
         "contrast": Column("contrast of the intensity"),
+        "path_residual_rms_m": Column("error of the line of sight, rms", "m", drawn="rms"),
+        "image_error_db": Column("error of the complex samples, as predicted by `requires`", "dB"),
         "ok": Column("share of trials called reliable"),
         "seconds": Column("time of a trial", "s"),
     }
@@ -373,11 +316,24 @@ class AnyPath(System):
         "pslr_range_db": Column("PSLR in range", "dB"),
     }
 
-    draw_case = (_images, _geometry, _paths)
+    draw_case = (images, geometry, paths)
     read = staticmethod(read_history)  # pyright: ignore[reportAssignmentType]
 
     def context(self, recording: Recording) -> dict[str, Any]:
         return {"side_data": recording.aux}
+
+    def extra_definitions(self, bench: Bench) -> Mapping[str, Any]:
+        left = {
+            f"{name}.{key}": text
+            for name, chain in bench.chains.items()
+            for key, stage in chain.stages.items()
+            if (text := getattr(stage, "not_estimated", ""))
+        }
+        return {**super().extra_definitions(bench), **({"not_estimated": left} if left else {})}
+
+    def notes(self, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+        for stage, text in metrics["definitions"].get("not_estimated", {}).items():
+            yield f"Not estimated by {stage}, and not part of its outcome", f"{text[0].upper()}{text[1:]}."
 
     def judge(self, bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -> Judged:
         """Return the metrics of the image and of the path by one method.
@@ -404,8 +360,11 @@ class AnyPath(System):
         if ideal is outcome or len({signal.axes for signal in signals}) != 1 or len(signals) != 2:
             return judged
         count = len(judged.metrics["path_residual_rms_m"])
-        error = registered_error_db(*(signal.data for signal in signals)).expand(count)
-        return replace(judged, metrics={**judged.metrics, "image_error_db": error})
+        errors = registered_errors(*(signal.data for signal in signals))
+        # images that differ by rounding only have no errors to compare
+        if bool((errors["image_error_db"] < -150).all()):
+            errors = {"image_error_db": errors["image_error_db"]}
+        return replace(judged, metrics={**judged.metrics, **{key: x.expand(count) for key, x in errors.items()}})
 
     def bounds(self, bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
         """Return the Cramer-Rao bound of the line of sight, (trial,); nothing for large or recorded
