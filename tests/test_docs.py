@@ -27,7 +27,12 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.glob("*.md")), *sorted(DOCS.glob("[a-z]*/*.md"))]
 # files of the reader, which are not in the repository
-THEIRS = {"my_strip.yaml": "stripmap_damaged", "my_radar.yaml": "recorded_strip", "CONFIG": "isal_snr"}
+THEIRS = {
+    "my_strip.yaml": "stripmap_damaged",
+    "my_radar.yaml": "recorded_strip",
+    "my_flight.yaml": "drone_stripmap",
+    "CONFIG": "isal_snr",
+}
 
 
 # smaller scenes than those that a page shows, whose results are not looked at here

@@ -63,3 +63,27 @@ def test_estimates_of_targets_and_of_further_trials_are_accepted() -> None:
 def test_a_wrong_argument_is_what_the_error_says() -> None:
     with pytest.raises(TypeError, match="unexpected keyword argument 'gain'"):
         Estimates(gain=2.0)  # pyright: ignore[reportCallIssue]
+
+
+class Pairs(Stage):
+    """Returns a tuple that a test makes."""
+
+    def __init__(self, make: Callable[[Signal], tuple]) -> None:
+        super().__init__()
+        self.make = make
+
+    def forward(self, signal: Signal) -> tuple:
+        return self.make(signal)
+
+
+@pytest.mark.parametrize(
+    "make, said",
+    [
+        (lambda x: (x, x), r"\(Signal, Signal\)"),
+        (lambda x: (x, None, 3), r"\(Signal, NoneType, int\)"),
+        (lambda x: (x, (x,)), r"\(Signal, \(Signal\)\)"),
+    ],
+)
+def test_a_tuple_that_is_no_signal_with_estimate_is_named(make: Callable[[Signal], tuple], said: str) -> None:
+    with pytest.raises(TypeError, match=rf"stage 'pair' \(Pairs\) returned {said}; a stage returns a Signal"):
+        Chain(pair=Pairs(make))(SIGNAL)

@@ -71,6 +71,8 @@ def test_signatures_become_keys_and_values_become_what_they_ask_for() -> None:
     assert made.table.dtype == torch.float64 and made.table.tolist() == [1.0, 2.0]
     level = torch.tensor([1.0, 2.0])
     assert catalogue.make(entry, "here", "file", {"level": level}, radar=0).level is level
+    with pytest.raises(ConfigError, match=r"here.stage names an unknown stage \{'a': 1\}"):
+        catalogue.check({"stage": {"a": 1}}, "here", "file")
     for wrong in ({"count": 1.5}, {"count": True}, {"pair": 3}, {"level": "x"}, {"radar": 1}):
         with pytest.raises(ConfigError, match="here"):
             catalogue.check({"stage": "sample", **wrong}, "here", "file")
@@ -81,6 +83,11 @@ def test_a_parameter_that_yaml_cannot_hold_is_a_fault_of_the_program() -> None:
 
     with pytest.raises(TypeError, match="'law'.*register a factory"):
         assert Section(takes_function).keys
+
+    def says_nothing(law) -> None: ...  # type: ignore[no-untyped-def]
+
+    with pytest.raises(TypeError, match="parameter 'law' has no annotation, and cannot be written"):
+        assert Section(says_nothing).keys
 
 
 class Broken:

@@ -511,12 +511,12 @@ class Chain(Shown, nn.Module):
         if isinstance(result, Mapping):
             known.metrics |= {f"{name}.{key}" if key else name: value for key, value in result.items()}
             return signal
-        out, estimate = result if isinstance(result, tuple) else (result, None)
+        out, estimate = result if isinstance(result, tuple) and len(result) == 2 else (result, None)
         if isinstance(out, Estimate):
             out, estimate = signal, out
-        if not isinstance(out, Signal):
+        if not isinstance(out, Signal) or not isinstance(estimate, Estimate | None):
             raise TypeError(
-                f"stage {name!r} ({type(stage).__name__}) returned {type(out).__name__}; a stage "
+                f"stage {name!r} ({type(stage).__name__}) returned {_kinds(result)}; a stage "
                 "returns a Signal, an Estimate, (Signal, Estimate), or metrics by name"
             )
         if estimate is not None:
@@ -526,6 +526,11 @@ class Chain(Shown, nn.Module):
                 unchanged = estimate.unused(self.in_doubt[name])[(...,) + (None,) * len(out.axes)]
                 out = out.with_data(torch.where(unchanged, signal.data, out.data))
         return out
+
+
+def _kinds(result: Any) -> str:
+    """Name of the type of a result, or of those of the members of a tuple."""
+    return f"({', '.join(map(_kinds, result))})" if isinstance(result, tuple) else type(result).__name__
 
 
 def _corrected(signal: Signal, out: Signal, estimate: Estimate) -> bool:

@@ -399,6 +399,7 @@ def _within(antennas: AntennaPath, points: Tensor, gain: Tensor, radar: InverseR
     if bool(lost.any()):
         raise ValueError(
             f"the lit scene must stay within {half:.4g} m of range from the middle of the window, but reaches "
-            f"{float((off.abs() * lost).max()):.4g} m; choose a smaller scene or more range cells"
+            f"{float((off.abs() * lost).max()):.4g} m; choose a smaller scene, more range cells, or a "
+            "window about the distance of the scene (window_range_m, and the origin of a motion log)"
         )
     return within

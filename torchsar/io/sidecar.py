@@ -336,7 +336,7 @@ def _offset(tree: Mapping[str, Any], where: str) -> complex:
     """Complex offset that is subtracted from the samples."""
     given = tree.get("offset", 0)
     both = list(given) if isinstance(given, (list, tuple)) else [given, given]
-    if len(both) != 2 or not all(type(x) in (int, float) and math.isfinite(x) for x in both):
+    if len(both) != 2 or not all(type(x) in (int, float) and abs(x) < 1e300 for x in both):
         raise ValueError(f"{where}.offset must be {_SAMPLES['offset'][1]}, got {given!r}")
     return complex(*both)
 
@@ -412,7 +412,11 @@ def _section(tree: Any, where: str, accepted: _Keys, needed: Sequence[str] = ())
         if (
             words
             and value is not None
-            and (not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool))
+            and (
+                not isinstance(value, kind)
+                or (isinstance(value, bool) and kind is not bool)
+                or (isinstance(value, int) and abs(value) >= 2**63)
+            )
         ):
             raise ValueError(f"{where}.{key} must be {words}, got {value!r}")
     for key in needed:

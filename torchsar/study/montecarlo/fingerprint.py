@@ -28,7 +28,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchsar.study.settings.errors import ConfigError
+from torchsar.study.settings.errors import ConfigError, is_library
 
 # largest number of characters in a description of a value; a longer one is replaced by a digest
 _SHOWN = 40
@@ -241,21 +241,6 @@ def _parts_of_name(value: type | ModuleType) -> tuple[Any, ...]:
         if isinstance(one, FunctionType) or not key.startswith(("__", "_abc"))
     }
     return (value.__module__, value.__name__, value.__bases__, members)
-
-
-def is_library(module: str) -> bool:
-    """Decide whether a module belongs to the standard library or to an installed package.
-
-    Args:
-        module: Its name.
-
-    Returns:
-        The answer.
-    """
-    top = module.partition(".")[0]
-    file = getattr(sys.modules.get(module), "__file__", None) or ""
-    installed = "site-packages" in file or "dist-packages" in file
-    return top in sys.stdlib_module_names or top in ("torchsar", "torch", "numpy") or installed
 
 
 def _content(x: Tensor | np.ndarray) -> bytes:

@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
-from traceback import walk_tb
 from typing import Any
 
 import numpy as np
@@ -20,10 +19,10 @@ from torch.utils._pytree import tree_leaves
 
 from torchsar.core import Draws, Outcome, is_out_of_memory
 from torchsar.study.memory import PeakMemory
-from torchsar.study.montecarlo.fingerprint import code, is_library
+from torchsar.study.montecarlo.fingerprint import code
 from torchsar.study.montecarlo.grid import Case, Grid
 from torchsar.study.montecarlo.record import OK, OUTCOME
-from torchsar.study.settings.errors import ConfigError, one_line
+from torchsar.study.settings.errors import ConfigError, one_line, own_line
 
 # Larger batches take more time per trial, because they do not fit into the cache. Batches of fewer
 # than four trials take 10 to 25 % more time for the calls, as measured with sweeps of four systems.
@@ -238,7 +237,7 @@ class Work:
         if not is_out_of_memory(error):
             raise ConfigError(
                 f"{where}: {'' if isinstance(error, ConfigError) else type(error).__name__ + ': '}"
-                f"{one_line(error) or 'no message'}{_own_line(error)}"
+                f"{one_line(error) or 'no message'}{own_line(error)}"
             ) from error
         if len(chunk) == 1:
             raise ConfigError(
@@ -291,15 +290,6 @@ class Work:
             _numbers(bounds, n, f"{BOUNDS}."),
             {row: {name: _array(value, row, n, f"{SAVED}.{name}") for name, value in kept.items()} for row in rows},
         )
-
-
-def _own_line(error: BaseException) -> str:
-    """The innermost line of the user's code that an error passed through, as words; empty if it was
-    raised in the code of libraries alone.
-    """
-    frames = [(frame.f_globals.get("__name__"), frame, line) for frame, line in walk_tb(error.__traceback__)]
-    own = [(frame, line) for module, frame, line in frames if not is_library(str(module))]
-    return f" (line {own[-1][1]} of {own[-1][0].f_code.co_filename})" if own else ""
 
 
 def _global_generators() -> tuple[Any, ...]:

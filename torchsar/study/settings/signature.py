@@ -81,9 +81,10 @@ class Section:
             if key is not None:
                 found[parameter.name] = key
             elif parameter.default is parameter.empty:
+                kind = f"the type {hints[parameter.name]}" if parameter.name in hints else "no annotation"
                 raise TypeError(
-                    f"{self.target.__name__}: its parameter {parameter.name!r} of type {hints.get(parameter.name)} "
-                    "cannot be written in a config; register a factory instead"
+                    f"{self.target.__name__}: its parameter {parameter.name!r} has {kind}, and cannot be written in a "
+                    "config; annotate it as number, text or list, or register a factory instead"
                 )
         return found
 
@@ -248,7 +249,7 @@ class Catalogue:
         if name == AUTO:
             return entry
         new, _, more = RENAMED.get(str(name), "").partition(", ")
-        if name not in self.entries and new in self.entries:
+        if new in self.entries and name not in self.entries:
             text = "%s: %s: '%s: %s' is now called '%s: %s'"
             log.warning(text, file, where, self.key, name, self.key, RENAMED[name])
             name, rest = new, {**yaml.safe_load(f"{{{more}}}"), **rest}

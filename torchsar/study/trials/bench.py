@@ -31,7 +31,7 @@ from torchsar.core import (
 )
 from torchsar.core.stored import machine_memory_bytes
 from torchsar.echo import Simulate, apply_impairments
-from torchsar.study.settings.errors import ConfigError, did_you_mean, one_line
+from torchsar.study.settings.errors import ConfigError, did_you_mean, one_line, own_line
 from torchsar.study.settings.sections import LONGEST_NAME, OF_CHAIN, Loaded, Method
 from torchsar.study.trials.batch import Batch, Judged, Processed, Trials, fault_of_image, rows, verdict
 from torchsar.study.trials.choice import resolved
@@ -436,6 +436,6 @@ def reason_of(error: Exception, radar: Any) -> str:
             f"this stage needs radar.{missing.name}, which a radar of this system does not have; use a stage of this "
             "system"
         )
-    return ("" if isinstance(error, _PLAIN) and one_line(error) else f"{type(error).__name__}: ") + (
-        one_line(error) or "no message"
-    )
+    if isinstance(error, _PLAIN) and one_line(error):
+        return one_line(error)
+    return f"{type(error).__name__}: {one_line(error) or 'no message'}{own_line(error)}"
