@@ -138,8 +138,10 @@ class Points(Scene):
     trial.
 
     Args:
-        azimuth_m: Azimuths in metres.
-        range_m: Ranges in metres.
+        azimuth_m: Azimuths in metres, 0 at the middle pulse of a strip or at the origin of the
+            ground.
+        range_m: Ranges in metres, 0 in the middle of the recorded ranges of a strip, at the origin
+            of the ground seen from any path, or in the centre of a turntable.
         amplitude: Amplitudes; by default all are 1.
         random_phase: Whether each trial draws a random phase for every point.
 
