@@ -8,7 +8,7 @@ record of an instrument                  `Recording`: the signal, the instrument
 true values of a simulation              `Truth`
 processing step of your own              `Stage`
 several steps in order                   `Chain`; `use` passes a value to a later step; `Trace`
-                                         holds all results
+                                         holds all results, and `Spread` their uncertainty
 several effects, each estimated in turn  `Alternate` with one `Turn` for each
 result of an estimator                   `Estimate`; `Outcome` says whether it can be trusted,
                                          `counts` and `worst` combine outcomes
@@ -30,7 +30,7 @@ a derivative that does not exist         `DerivativeWarning`
 
 from torchsar.core import trees as trees  # registers signals and estimates with torch
 from torchsar.core.alternate import Alternate, Turn
-from torchsar.core.chain import Chain, Trace
+from torchsar.core.chain import Chain
 from torchsar.core.connect import Use, use
 from torchsar.core.derivatives import DerivativeWarning, differentiable
 from torchsar.core.draws import Draws, Source
@@ -79,8 +79,10 @@ from torchsar.core.phase import (
 from torchsar.core.select import best_of, numbers_on, per_trial, take, true_positions
 from torchsar.core.signal import Axis, Recording, Signal, Truth
 from torchsar.core.spline import Spline, legendre
+from torchsar.core.spread import Spread
 from torchsar.core.stage import Stage
 from torchsar.core.stored import ArrayFile, StoredArray
+from torchsar.core.trace import Trace
 
 __all__ = [
     "Alternate",
@@ -93,6 +95,7 @@ __all__ = [
     "Signal",
     "Source",
     "Spline",
+    "Spread",
     "Stage",
     "Trace",
     "Truth",

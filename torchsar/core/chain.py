@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 import time
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -15,170 +14,10 @@ from torchsar.core.connect import Use, run_module
 from torchsar.core.draws import Draws
 from torchsar.core.estimate import Estimate
 from torchsar.core.host import gathered_checks
-from torchsar.core.show import Shown, Summary, content, kind_of, one_number
-from torchsar.core.signal import Recording, Signal, Truth
-
-Given = Mapping[str, Tensor | Estimate]
-
-
-@dataclass(frozen=True, repr=False)
-class Trace(Shown):
-    """All intermediate results of one run of a chain, by the names of the stages.
-
-    >>> import torch
-    >>> from torchsar import Axis, Chain, Signal, compensate
-    >>> axes = Axis("pulse", 3, 0.0, 0.1, "s"), Axis("range", 2, 0.0, 1.0, "m")
-    >>> chain = Chain(phase=compensate.Sca(assess=False))
-    >>> trace = chain.trace(Signal(torch.tensor([[1, 0], [1j, 0], [-1, 0]]), axes))
-    >>> trace.values["phase.phase_rad"]
-    tensor([0.0000, 1.5708, 3.1416])
-
-    Args:
-        inputs: Signal before each stage.
-        outputs: Signal after each stage.
-        estimates: Estimates of the stages that returned an Estimate.
-        values: Estimated and given values under "STAGE.VALUE", side data under "aux.NAME", true
-            values of a simulation under "truth.NAME".
-        seconds: Wall time of each stage, in seconds; empty inside a program of `torch.compile`.
-        bytes: Size of the samples after each stage, in bytes.
-        neutral: Trials in which a stage did not use an estimate, because it failed or, with
-            `in_doubt="neutral"`, because it is doubtful; bool with the shape of `outcome`: under
-            "STAGE.PARAMETER" those in which this parameter of the stage got a neutral value, and
-            under "STAGE" those in which a stage that both estimates and corrects left the signal
-            unchanged.
-        doubtful: Trials in which a stage used a doubtful estimate, by the same names.
-        arguments: Values that each stage received from its connections, by its name and parameter;
-            neutral where the estimate was not used.
-        metrics: Numbers of the stages that measure, under "STAGE", or "STAGE.NAME" if there are
-            several.
-        truth: True values, if a stage of the chain simulates or impairs the recording.
-    """
-
-    inputs: Mapping[str, Signal]
-    outputs: Mapping[str, Signal]
-    estimates: Mapping[str, Estimate]
-    values: Mapping[str, Tensor]
-    seconds: Mapping[str, float]
-    bytes: Mapping[str, int]
-    neutral: Mapping[str, Tensor] = field(default_factory=dict)
-    doubtful: Mapping[str, Tensor] = field(default_factory=dict)
-    arguments: Mapping[str, Mapping[str, Tensor]] = field(default_factory=dict)
-    metrics: Mapping[str, Tensor] = field(default_factory=dict)
-    truth: Truth | None = None
-
-    @property
-    def signal(self) -> Signal:
-        """Signal after the last stage."""
-        return list(self.outputs.values())[-1]
-
-    def _summary(self) -> Summary:
-        stages = []
-        for name, signal in self.outputs.items():
-            estimate, seconds = self.estimates.get(name), self.seconds.get(name)
-            found = "" if estimate is None else f"{' and '.join(estimate.value)} {estimate._verdict}"
-            took = "" if seconds is None else f"{seconds:.3g} s"
-            stages.append(
-                (name, f"{kind_of(signal.data)} of {' and '.join(signal.names)}", found, self._used(name), took)
-            )
-        tables = {"signals, estimates and times after stages": stages}
-        if self.metrics:
-            tables["metrics"] = [(name, content(value)) for name, value in self.metrics.items()]
-        return Summary(f"{sum(self.seconds.values()):.3g} s", tables)
-
-    def _used(self, name: str) -> str:
-        """Describe in words in how many trials a stage used neutral or doubtful values."""
-        words = []
-        for kind, masks in (("neutral", self.neutral), ("doubtful", self.doubtful)):
-            for key, mask in masks.items():
-                stage, _, parameter = key.partition(".")
-                count = one_number(mask.sum()) if stage == name else None
-                words += [f"{parameter or 'correction'} {kind} in {count} of {mask.numel()}"] if count else []
-        return " and ".join(words)
-
-
-@dataclass
-class _Known:
-    """Named values of a run, with the estimates that they come from.
-
-    The caller gave the values named in `held` and the estimates of the stages named in `stages`.
-    """
-
-    values: dict[str, Tensor]
-    estimates: dict[str, Estimate]
-    held: frozenset[str] = frozenset()
-    stages: frozenset[str] = frozenset()
-    radar: Any = None
-    metrics: dict[str, Tensor] = field(default_factory=dict)
-    clean: Recording | None = None
-    draws: Draws | None = None
-
-    def with_given(self, given: Given, stages: Mapping[str, nn.Module]) -> _Known:
-        """Replace values by those that the caller gives for the stages of a chain."""
-        if not isinstance(given, Mapping):
-            raise TypeError(f"`given` must map names to values or estimates, got {type(given).__name__}")
-        values = {name: value for name, value in given.items() if not isinstance(value, Estimate)}
-        estimates = {name: value for name, value in given.items() if isinstance(value, Estimate)}
-        held = {"held": frozenset(values), "stages": frozenset(estimates)}
-        known = replace(self, values={**self.values, **values}, estimates=dict(self.estimates), **held)
-        for name, estimate in estimates.items():
-            _check_trials(name, estimate)
-            known.add(name, _with_neutral(estimate, stages.get(name)))
-        return known
-
-    def add(self, name: str, estimate: Estimate) -> None:
-        """Add the estimate of a stage; values that the caller gave are not replaced."""
-        self.estimates[name] = estimate
-        self.values |= {f"{name}.{key}": v for key, v in estimate.value.items() if f"{name}.{key}" not in self.held}
-
-    def recording(self, signal: Signal) -> Recording:
-        """Combine a signal with the radar and the side data into a recording."""
-        return Recording(signal, self.radar, self._under("aux."))
-
-    @property
-    def truth(self) -> Truth | None:
-        """True values of the simulation; None if the data were not simulated."""
-        values = self._under("truth.")
-        return Truth(values, self.clean) if values else None
-
-    def _under(self, prefix: str) -> dict[str, Tensor]:
-        return {name.removeprefix(prefix): value for name, value in self.values.items() if name.startswith(prefix)}
-
-    def take_over(self, recording: Recording, truth: Truth, prefix: str) -> None:
-        """Take the radar, the side data and the true values of a stage that makes a recording."""
-        new = {f"aux.{key}": value for key, value in recording.aux.items()}
-        new |= {f"truth.{prefix}{key}": value for key, value in truth.values.items()}
-        self.values |= {name: value for name, value in new.items() if name not in self.held}
-        self.radar, self.clean = recording.radar, self.clean if truth.clean is None else truth.clean
-
-    def origin(self, source: str) -> tuple[Estimate, str] | None:
-        """Estimate that a value comes from, and its name there.
-
-        The result is None if the value is not estimated, was replaced, or has no neutral value.
-        """
-        name, _, key = source.partition(".")
-        estimate = self.estimates.get(name)
-        if estimate is None or key not in estimate.neutral or self.values[source] is not estimate.value[key]:
-            return None
-        return estimate, key
-
-
-@dataclass
-class _Log:
-    """Times, sizes and outputs of the stages of a run, from which its Trace is made."""
-
-    inputs: dict[str, Signal] = field(default_factory=dict)
-    outputs: dict[str, Signal] = field(default_factory=dict)
-    seconds: dict[str, float] = field(default_factory=dict)
-    bytes: dict[str, int] = field(default_factory=dict)
-    neutral: dict[str, Tensor] = field(default_factory=dict)
-    doubtful: dict[str, Tensor] = field(default_factory=dict)
-    arguments: dict[str, Mapping[str, Tensor]] = field(default_factory=dict)
-
-    def trace(self, known: _Known) -> Trace:
-        """Make the trace of the run from the log and these values and estimates."""
-        parts = {name: getattr(self, name) for name in ("seconds", "bytes", "neutral", "doubtful", "arguments")}
-        parts |= {"metrics": known.metrics, "truth": known.truth}
-        return Trace(self.inputs, self.outputs, known.estimates, known.values, **parts)
+from torchsar.core.show import Shown, Summary
+from torchsar.core.signal import Recording, Signal
+from torchsar.core.spread import Spread, spread_of
+from torchsar.core.trace import Given, Known, Log, Trace
 
 
 class Chain(Shown, nn.Module):
@@ -335,7 +174,7 @@ class Chain(Shown, nn.Module):
                 a stage needs random draws and there are none.
         """
         signal, known = self._start(x, given, draws)
-        log = _Log()
+        log = Log()
         self._run(list(self.stages), signal, known, log)
         return log.trace(known)
 
@@ -378,7 +217,7 @@ class Chain(Shown, nn.Module):
         part, known = self._part(trace, start, None, given)
         before = [name for name in trace.outputs if name not in part]
         inputs = {name: signal for name, signal in trace.inputs.items() if name in before}
-        log = _Log(inputs, {name: trace.outputs[name] for name in before})
+        log = Log(inputs, {name: trace.outputs[name] for name in before})
         known.metrics = {key: x for key, x in trace.metrics.items() if key.partition(".")[0] in before}
         log.arguments |= {name: trace.arguments[name] for name in before}
         for here, there in ((log.neutral, trace.neutral), (log.doubtful, trace.doubtful)):
@@ -386,9 +225,58 @@ class Chain(Shown, nn.Module):
         self._run(part, trace.inputs[start], known, log)
         return log.trace(known)
 
+    def spread(self, trace: Trace, of: Collection[str] | None = None, pairs: int = 32) -> Spread:
+        """Carry the errors of estimates through the stages that use them, to pixels and metrics.
+
+        The estimates are moved by their standard deviations, or by their factors (see `Estimate`),
+        in one direction and in the opposite one, and the stages after them are repeated. The result
+        is the root mean square of the changes. A value has the signs + and - in these pairs, and n
+        values take n pairs, rounded up to a power of two, with which the result is exact for small
+        errors. If these are more than `pairs`, as for a phase per pulse, so many are chosen at
+        random, always the same ones, and the result is uncertain by a share of at most
+        `1 / (2 * pairs) ** 0.5`.
+
+        A metric which the estimate itself makes best, such as the entropy after autofocus, has no
+        first derivative there; the result is then the size of its change by the curvature.
+
+        Errors of different estimates, and within an estimate without factors those of different
+        values, count as independent. Values without a standard deviation count as exact, and so do
+        the samples: the noise that reaches the image directly is not part of the result. It is
+        infinite in trials in which a standard deviation is, and zero where the estimate failed,
+        because its neutral value is used.
+
+        >>> import torch
+        >>> from torchsar import Axis, Chain, Estimate, Signal, compensate, metrics, use
+        >>> axes = Axis("pulse", 4, 0.0, 0.1, "s"), Axis("range", 1, 0.0, 1.0, "m")
+        >>> chain = Chain(
+        ...     phase=compensate.Sca(),
+        ...     correct=use(compensate.CorrectPulsePhase(), phase_rad="phase"),
+        ...     sum=metrics.Measure(lambda signal: signal.data.sum((-2, -1)).abs()),
+        ... )
+        >>> value, std = torch.tensor([0.0, 0.3, 0.0, 0.3]), torch.full((4,), 0.1)
+        >>> phase = Estimate({"phase_rad": value}, {"phase_rad": std}, torch.ones(()))
+        >>> trace = chain.trace(Signal(torch.ones(4, 1) + 0j, axes), given={"phase": phase})
+        >>> round(float(chain.spread(trace).metrics["sum"]), 3)
+        0.034
+
+        Args:
+            trace: Result of an earlier call of the method `trace`.
+            of: Names of the estimates whose errors count; None for all that a later stage uses.
+            pairs: Largest number of pairs; the stages are repeated twice for each.
+
+        Returns:
+            Standard deviations of the moduli of the pixels of `trace.signal` and of the metrics of
+            the trace.
+
+        Raises:
+            ValueError: If no later stage uses a value with a standard deviation, or a stage that
+                both estimates and corrects has one, since it cannot be repeated with another value.
+        """
+        return spread_of(self, trace, of, pairs)
+
     def _start(
         self, x: Recording | Signal | None, given: Given | None, draws: Draws | None
-    ) -> tuple[Signal | None, _Known]:
+    ) -> tuple[Signal | None, Known]:
         """Signal with which a run starts, and the values that are known before its first stage."""
         random = [name for name, stage in self.stages.items() if _on_recording(stage)]
         begins = random[:1] == list(self.stages)[:1]
@@ -404,7 +292,7 @@ class Chain(Shown, nn.Module):
             )
         aux = {f"aux.{name}": value for name, value in x.aux.items()} if isinstance(x, Recording) else {}
         radar = x.radar if isinstance(x, Recording) else None
-        known = _Known({**aux}, {}, radar=radar, draws=draws)
+        known = Known({**aux}, {}, radar=radar, draws=draws)
         known = known.with_given({} if given is None else given, dict(self.stages.named_children()))
         available = {f"{name}.{key}" for name, stage in self.stages.items() for key in _provided(stage)} | set(aux)
         available |= {source for names in self.uses.values() for source in names.values()}
@@ -413,7 +301,7 @@ class Chain(Shown, nn.Module):
             raise KeyError(f"`given` has unknown names {sorted(unknown)}; the chain has the values {sorted(available)}")
         return x.signal if isinstance(x, Recording) else x, known
 
-    def _part(self, trace: Trace, start: str, stop: str | None, given: Given | None) -> tuple[list[str], _Known]:
+    def _part(self, trace: Trace, start: str, stop: str | None, given: Given | None) -> tuple[list[str], Known]:
         """Names of the stages that a rerun repeats, and the values that are known before the first
         of them.
         """
@@ -429,7 +317,7 @@ class Chain(Shown, nn.Module):
             raise ValueError(f"stage {random[0]!r} makes the recording; a chain is rerun from a stage after it")
         before = {name: estimate for name, estimate in trace.estimates.items() if name not in part}
         clean = None if trace.truth is None else trace.truth.clean
-        known = _Known(dict(trace.values), before, clean=clean).with_given(
+        known = Known(dict(trace.values), before, clean=clean).with_given(
             {} if given is None else given, dict(self.stages.named_children())
         )
         unknown = (known.held - set(trace.values)) | (known.stages - set(names))
@@ -439,7 +327,7 @@ class Chain(Shown, nn.Module):
             )
         return part, known
 
-    def _run(self, names: list[str], signal: Any, known: _Known, log: _Log | None = None) -> Signal:
+    def _run(self, names: list[str], signal: Any, known: Known, log: Log | None = None) -> Signal:
         """Run the named stages in order; the signal before a simulation is None."""
         timed = log is not None and not torch.compiler.is_dynamo_compiling()
         for name in names:
@@ -464,7 +352,7 @@ class Chain(Shown, nn.Module):
                     log.doubtful[key] = estimate.doubtful & ~log.neutral[key]
         return signal
 
-    def _arguments(self, name: str, known: _Known, required: bool) -> tuple[dict[str, Tensor], dict[str, Estimate]]:
+    def _arguments(self, name: str, known: Known, required: bool) -> tuple[dict[str, Tensor], dict[str, Estimate]]:
         """Values connected to the parameters of a stage, and the estimates that they come from.
 
         The estimates have the keys "STAGE.PARAMETER"; an estimate without a neutral value is left
@@ -492,7 +380,7 @@ class Chain(Shown, nn.Module):
         stage: nn.Module,
         signal: Signal | None,
         arguments: dict[str, Tensor],
-        known: _Known,
+        known: Known,
         origins: dict[str, Estimate],
     ) -> Signal:
         """Run a stage and return the signal after it.
@@ -557,23 +445,6 @@ def _on_recording(stage: nn.Module) -> bool:
 def _provided(stage: nn.Module) -> Collection[str]:
     """Names of the values that a stage estimates."""
     return getattr(stage, "provides", ())
-
-
-def _with_neutral(estimate: Estimate, stage: nn.Module | None) -> Estimate:
-    """Add the neutral values of a stage to an estimate that has none for them."""
-    known = {key: number for key, number in getattr(stage, "neutral", {}).items() if not isinstance(number, str)}
-    missing = {key: known[key] for key in estimate.value if key in known and key not in estimate.neutral}
-    return replace(estimate, neutral={**estimate.neutral, **missing}) if missing else estimate
-
-
-def _check_trials(name: str, estimate: Estimate) -> None:
-    """Raise ValueError unless the values of a given estimate begin with its trial dimensions."""
-    for key, value in estimate.value.items():
-        if value.shape[: estimate.outcome.ndim] != estimate.outcome.shape:
-            raise ValueError(
-                f"`given`: the value {key!r} of the estimate {name!r} must begin with the trial dimensions "
-                f"{tuple(estimate.outcome.shape)} of `outcome`, got the shape {tuple(value.shape)}"
-            )
 
 
 def _check_member(name: str, stage: object) -> None:

@@ -180,7 +180,7 @@ class Estimate(Shown):
             or `phase_rad` of shape (..., pulse). Finite in all trials.
         std: Predicted standard deviations, with the names, shapes and units of the values; only for
             those values whose standard deviation theory predicts. Derivatives belong to the values:
-            `std` and `quality` are constant for them.
+            `std`, `factor` and `quality` are constant for them.
         quality: Quality from 0 (unusable) to 1, shape (...,); each estimator defines how it is
             measured. By default 1 where the estimate is ok, and 0 elsewhere.
         outcome: Code of an `Outcome` in each trial, shape (...,), integer; where there are several
@@ -190,6 +190,10 @@ class Estimate(Shown):
         neutral: Neutral values by name: what to assume where the estimate failed, such as no phase
             error or the nominal velocity. Numbers, or tensors that broadcast to the value. A stage
             fills it in, see `Stage`.
+        factor: Correlated errors: for values by name a tensor of shape (*value.shape, component).
+            The errors of all these values are the products with common independent components of
+            unit variance, so that F F^T is their covariance. Values without it have independent
+            errors of the size `std`. See `Chain.spread`.
 
     Raises:
         TypeError: If `value` or `std` is not a mapping of tensors.
@@ -203,6 +207,7 @@ class Estimate(Shown):
     outcome: Tensor = None  # pyright: ignore[reportAssignmentType]
     info: Mapping[str, Tensor] = field(default_factory=dict)
     neutral: Mapping[str, Tensor | float] = field(default_factory=dict)
+    factor: Mapping[str, Tensor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for field_name, table in (("value", self.value), ("std", self.std)):
@@ -227,13 +232,21 @@ class Estimate(Shown):
                 f"`quality`, got `outcome` of {self.outcome.dtype} with shape {tuple(self.outcome.shape)} and "
                 f"`quality` with shape {tuple(self.quality.shape)}; Outcome.of(ok, otherwise) makes it from bools"
             )
-        object.__setattr__(self, "std", {name: x.detach() for name, x in self.std.items()})
+        for field_name, table in (("std", self.std), ("factor", self.factor)):
+            object.__setattr__(self, field_name, {name: x.detach() for name, x in table.items()})
         object.__setattr__(self, "quality", self.quality.detach())
         for name, x in self.std.items():
             if name not in self.value or x.shape != self.value[name].shape:
                 raise ValueError(
                     f"the standard deviation {name!r} of an Estimate has the shape {tuple(x.shape)}; give one with the "
                     f"name and the shape of a value: { {k: tuple(v.shape) for k, v in self.value.items()} }"
+                )
+        for name, x in self.factor.items():
+            if name not in self.std or x.shape[:-1] != self.std[name].shape:
+                raise ValueError(
+                    f"the factor {name!r} of an Estimate has the shape {tuple(x.shape)}; give it for a value with a "
+                    f"standard deviation, with its shape and one more dimension: "
+                    f"{ {k: (*v.shape, 'component') for k, v in self.std.items()} }"
                 )
 
     def __getitem__(self, name: str) -> Tensor:
@@ -336,9 +349,11 @@ class Estimate(Shown):
         def named(tables: list[Mapping[str, Tensor]]) -> dict[str, Tensor]:
             return {name: whole([table[name] for table in tables]) for name in tables[0]}
 
-        value, std, info = (named([getattr(part, table) for part in parts]) for table in ("value", "std", "info"))
+        value, std, info, factor = (
+            named([getattr(part, table) for part in parts]) for table in ("value", "std", "info", "factor")
+        )
         quality, outcome = (whole([getattr(part, name) for part in parts]) for name in ("quality", "outcome"))
-        return Estimate(value, std, quality, outcome, info)
+        return Estimate(value, std, quality, outcome, info, factor=factor)
 
 
 def settle(value: Tensor, fallback: Tensor | float) -> tuple[Tensor, Tensor]:

@@ -16,14 +16,16 @@ _WORKING = {torch.float16: torch.float32, torch.bfloat16: torch.float32, torch.c
 
 
 def _tensor(image: Tensor | Signal) -> Tensor:
-    """Samples (..., azimuth, range) of an image; raises TypeError or ValueError for anything
-    else.
+    """Samples (..., azimuth, range) of an image, with one row for a Signal of one axis; raises
+    TypeError or ValueError for anything else.
     """
     x = image.data if isinstance(image, Signal) else image
     if not isinstance(x, Tensor) or x.dtype == torch.bool:
         raise TypeError(
             f"an image is a Signal or a tensor of numbers, got {x.dtype if isinstance(x, Tensor) else type(x).__name__}"
         )
+    if isinstance(image, Signal) and len(image.axes) == 1:
+        x = x[..., None, :]
     if x.ndim < 2 or not x.numel():
         raise ValueError(
             f"an image has the dims (..., azimuth, range) and at least one pixel, got the shape {tuple(x.shape)}"

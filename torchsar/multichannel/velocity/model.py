@@ -298,10 +298,13 @@ def estimate_of(found: Found, outcome: Tensor | None = None, info: Mapping[str, 
     value = {name: getattr(found.motion, name).expand(snr_db.shape) for name in UNKNOWNS}
     std_all = found.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
     std = {name: std_all[..., i] for i, name in enumerate(found.unknowns)}
+    root, wrong = torch.linalg.cholesky_ex(found.covariance)
+    root = torch.where((wrong == 0)[..., None, None], root, torch.diag_embed(std_all))
+    factor = dict(zip(found.unknowns, root.unbind(-2), strict=True))
     info = {"snr_db": snr_db, "noise_power": found.noise_power, **(info or {})}
     if outcome is None:
-        return Estimate(value, std, outcome=Outcome.NOT_ASSESSED.like(snr_db), info=info)
-    return Estimate(value, std, quality_of(snr_db), outcome, info)
+        return Estimate(value, std, outcome=Outcome.NOT_ASSESSED.like(snr_db), info=info, factor=factor)
+    return Estimate(value, std, quality_of(snr_db), outcome, info, factor=factor)
 
 
 def quality_of(snr_db: Tensor) -> Tensor:

@@ -1,0 +1,172 @@
+"""Uncertainty of an image: the errors of estimates, carried through the stages that use them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from torchsar.core.draws import Draws
+from torchsar.core.estimate import Estimate
+from torchsar.core.show import Shown, Summary, content
+
+if TYPE_CHECKING:
+    from torchsar.core.chain import Chain
+    from torchsar.core.trace import Trace
+
+
+@dataclass(frozen=True, repr=False)
+class Spread(Shown):
+    """Standard deviations of an image and of its metrics by the errors of estimates.
+
+    >>> import torch
+    >>> from torchsar.core import Spread
+    >>> Spread(torch.full((2, 2), 0.1), {"entropy": torch.tensor(0.02)})
+    Spread(pixels float32 (2, 2); entropy: 0.02)
+
+    `Chain.spread` makes it.
+
+    Args:
+        pixels: Standard deviation of the modulus of each pixel, in the shape of the samples.
+        metrics: Standard deviations of the metrics of a trace, by their names and in their units.
+    """
+
+    pixels: Tensor
+    metrics: Mapping[str, Tensor]
+
+    def _summary(self) -> Summary:
+        metrics = [(f"{name}: {content(value)}",) for name, value in self.metrics.items()]
+        return Summary(f"pixels {content(self.pixels)}", {"standard deviations of metrics": metrics})
+
+
+@dataclass(frozen=True)
+class _Error:
+    """Error of a value of an estimate.
+
+    Args:
+        estimate: The estimate.
+        key: Name of the value.
+        trials: Trial dimensions of the estimate.
+    """
+
+    estimate: Estimate
+    key: str
+    trials: torch.Size
+
+    @property
+    def signs(self) -> tuple[int, ...]:
+        """Shape of its independent signs in a trial.
+
+        Values with factors have one for each component, which differ between targets.
+        """
+        shape, n = self.estimate.std[self.key].shape, len(self.trials)
+        factor = self.estimate.factor.get(self.key)
+        return tuple(shape[n:] if factor is None else (*self.estimate.outcome.shape[n:], factor.shape[-1]))
+
+    def with_signs(self, signs: Tensor) -> Tensor:
+        """Error with these signs, in the shape of the value; zero where its size is not finite."""
+        std, factor = self.estimate.std[self.key], self.estimate.factor.get(self.key)
+        if factor is None:
+            error = std * signs.to(std)
+        else:
+            between = (None,) * (std.ndim - self.estimate.outcome.ndim)
+            error = (factor * signs.to(factor)[(..., *between, slice(None))]).sum(-1)
+        return torch.where(error.isfinite(), error, 0)
+
+    @property
+    def unknown(self) -> Tensor:
+        """True in trials in which the value is used and its standard deviation is not finite."""
+        std, failed = self.estimate.std[self.key], self.estimate.failed
+        lost = ~std.isfinite() & ~failed[(..., *(None,) * (std.ndim - failed.ndim))]
+        return lost.reshape(*self.trials, -1).any(-1)
+
+
+def spread_of(chain: Chain, trace: Trace, of: Collection[str] | None, pairs: int) -> Spread:
+    """Carry the errors of estimates to pixels and metrics; see `Chain.spread`.
+
+    Args:
+        chain: The chain.
+        trace: Its trace.
+        of: Names of the estimates whose errors count; None for all.
+        pairs: Largest number of pairs of directions.
+
+    Returns:
+        Standard deviations of pixels and metrics.
+    """
+    errors, start = _errors(chain, trace, of)
+    # values with factors share the signs of their estimate
+    slots = {(name, "" if key in x.estimate.factor else key): x.signs for (name, key), x in errors.items()}
+    sizes = [math.prod(shape) for shape in slots.values()]
+    # an estimate of a stage that also corrects cannot be held; that stage is repeated
+    held = {name: x for name, x in trace.estimates.items() if not _corrects(trace, name)}
+    plain = {"": trace.signal.data.abs(), **trace.metrics}
+    total = {name: torch.zeros_like(x.abs(), dtype=torch.float64) for name, x in plain.items()}
+    with torch.no_grad():
+        table = _signs(sum(sizes), pairs)
+        for row in torch.cat([table, -table]):
+            parts = dict(
+                zip(slots, (x.reshape(shape) for x, shape in zip(row.split(sizes), slots.values())), strict=True)
+            )
+            given: dict[str, Any] = dict(held)
+            for (name, key), x in errors.items():
+                error = x.with_signs(parts[name, "" if key in x.estimate.factor else key])
+                given[name] = replace(given[name], value={**given[name].value, key: x.estimate.value[key] + error})
+            again = chain.retrace(trace, start, given)
+            for name, x in {"": again.signal.data.abs(), **again.metrics}.items():
+                change = x.to(torch.promote_types(x.dtype, torch.float32)) - plain[name]
+                total[name] += change.abs().double().square() / (2 * len(table))
+    lost = torch.stack([x.unknown for x in errors.values()]).any(0)
+    found = {
+        name: torch.where(lost[(..., *(None,) * (x.ndim - lost.ndim))], math.inf, x.sqrt()) for name, x in total.items()
+    }
+    return Spread(found.pop("").to(plain[""].dtype), found)
+
+
+def _errors(chain: Chain, trace: Trace, of: Collection[str] | None) -> tuple[dict[tuple[str, str], _Error], str]:
+    """Errors of values that stages use, by estimate and value, and the first of these stages."""
+    sources = {name: {source.partition(".")[::2] for source in names.values()} for name, names in chain.uses.items()}
+    wanted = set(trace.estimates) if of is None else set(of)
+    if not wanted <= set(trace.estimates):
+        raise ValueError(f"`of` names the estimates {sorted(wanted)}, the trace has {sorted(trace.estimates)}")
+    for name in wanted:
+        if trace.estimates[name].std and _corrects(trace, name):
+            raise ValueError(
+                f"stage {name!r} both estimates and corrects, and cannot be repeated with another value; estimate and "
+                "correct in two stages, or leave it out: `of` names the estimates whose errors count"
+            )
+    errors = {
+        (name, key): _Error(trace.estimates[name], key, trace.outputs[name].trials)
+        for name, key in dict.fromkeys(pair for pairs in sources.values() for pair in sorted(pairs))
+        if name in wanted and key in trace.estimates[name].std
+    }
+    if not errors:
+        raise ValueError(
+            f"no stage uses a value with a standard deviation of the estimates {sorted(wanted)}; they have "
+            f"{ {name: sorted(trace.estimates[name].std) for name in sorted(wanted)} }; an estimator with "
+            "assess=True has them"
+        )
+    return errors, next(name for name, used in sources.items() if used & set(errors))
+
+
+def _corrects(trace: Trace, name: str) -> bool:
+    """True if the stage of an estimate has also changed the signal."""
+    return name in trace.inputs and trace.inputs[name] is not trace.outputs[name]
+
+
+def _signs(count: int, pairs: int) -> Tensor:
+    """Signs of independent errors in each pair, float64 (pair, error).
+
+    They are rows of a Hadamard matrix with random signs of its columns. All its rows together give
+    the exact variance of a linear function; of more rows than `pairs`, so many are chosen.
+    """
+    size = 1 << (count - 1).bit_length()
+    rows = Draws(0).permutation("rows", size, "cpu")[:pairs]
+    parity = rows[:, None] & torch.arange(count)
+    for shift in (32, 16, 8, 4, 2, 1):
+        parity = parity ^ (parity >> shift)
+    flipped = (Draws(0).uniform("columns", (count,), device="cpu") < 0.5).long()
+    return 1.0 - 2.0 * ((parity + flipped) & 1).double()
