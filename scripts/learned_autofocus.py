@@ -1,16 +1,18 @@
 """An autofocus whose image weights come from a small trained network, beside the library's own.
 
     python scripts/learned_autofocus.py [--small] [--trials 12] [--out learned_autofocus]
-    [--weights learned.json]
+    [--weights FOLDER]
 
 The estimator repeats one step: it forms the image, weights its cells, transforms the weighted image
 back to pulses, and takes the phase of each pulse relative to the result. It starts from SCA. It is
-the method `learned` of `torchsar bench autofocus`, with the parameters that --weights writes.
-Therefore, a phase that is added to a pulse is added to its estimate, whatever its size, and a
-constant or linear phase over the pulses changes nothing. `entropy_fixed_point` and `autofocus`
-repeat the same step with weights that follow from a formula. Here a network of 97 parameters
-computes the weight of each cell from the power of the cell, of its surroundings, of its range cell
-and of the noise.
+the method `learned` of `torchsar bench autofocus`, with the parameters that --weights writes. Two
+further networks of the benchmark, `unrolled` and `lag_network`, are then trained on the same
+scenes.
+
+A phase that is added to a pulse is added to its estimate, whatever its size, and a constant or
+linear phase over the pulses changes nothing. `entropy_fixed_point` and `autofocus` repeat the same
+step with weights that follow from a formula. Here a network of 97 parameters computes the weight of
+each cell from the power of the cell, of its surroundings, of its range cell and of the noise.
 
 The network is trained on small simulated scenes of the config `isal_snr` and tested on scenes of
 the full size of that config with other seeds. `torchsar.data.Simulated` makes both. All random
@@ -55,7 +57,7 @@ from torchsar.data import Simulated
 from torchsar.io import read_inverse
 from torchsar.metrics import entropy, phase_rmse
 from torchsar.metrics.bounds import pulse_phase_bound_of_scene_rad, pulse_phase_bound_rad, turntable_responses
-from torchsar.study.bench.learned import LearnedAutofocus, save_weights
+from torchsar.study.bench.learned import LagAutofocus, LearnedAutofocus, UnrolledAutofocus, save_weights
 
 CONFIG = "isal_snr"
 TRAIN_SEED, TEST_SEED = 11, 12
@@ -144,6 +146,11 @@ def loss_of_network(network: LearnedAutofocus, rounds: int = 3) -> Loss:
         return total / rounds
 
     return loss
+
+
+def loss_of_phases(network: Method) -> Loss:
+    """Loss of the phases that a network returns."""
+    return lambda data, truth, _: phase_loss(network(data), truth)
 
 
 def loss_of_stage(stage: EntropyFixedPoint, axes: tuple[Axis, ...]) -> Loss:
@@ -250,7 +257,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--small", action="store_true", help="few steps and tests on small scenes, in seconds")
     parser.add_argument("--trials", type=int, help="test scenes at each SNR (default 12, or 3 with --small)")
-    parser.add_argument("--weights", help="file for the trained parameters, .json, as the benchmark reads them")
+    text = "folder for the parameters of all networks of the benchmark, of which two more are then trained"
+    parser.add_argument("--weights", type=Path, help=text)
     parser.add_argument("--out", default="learned_autofocus", help="folder of the picture")
     options = parser.parse_args(arguments)
     steps, batch, size = (12, 4, TINY) if options.small else (240, 6, TRAINED)
@@ -266,7 +274,15 @@ def main(arguments: list[str] | None = None) -> None:
     print(f"training: {steps} steps of {batch} scenes, {time.perf_counter() - began:.0f} s")
 
     if options.weights:
-        save_weights(network, Path(options.weights))
+        options.weights.mkdir(parents=True, exist_ok=True)
+        save_weights(network, options.weights / "learned.json")
+        others = {"unrolled": UnrolledAutofocus(), "lag_network": LagAutofocus(Draws(TRAIN_SEED))}
+        for name, other in others.items():
+            began = time.perf_counter()
+            losses = train(other.parameters(), scenes(steps * batch, batch, size), loss_of_phases(other), rate=0.02)
+            save_weights(other, options.weights / f"{name}.json")
+            part = losses[-(steps // 6) :]
+            print(f"{name}: {time.perf_counter() - began:.0f} s, mean loss {sum(part) / len(part):.6f} at the end")
 
     stage = EntropyFixedPoint(nn.Parameter(torch.tensor([5.0, 2.0])))
     few = scenes(steps * batch // 8, batch, size)

@@ -45,7 +45,7 @@ OTHER = {
 
 
 # Methods that are no public functions or stages.
-SIMPLE = {"textbook_pga", "adam_entropy", "uncorrected", "learned"}
+SIMPLE = {"textbook_pga", "adam_entropy", "uncorrected", "learned", "unrolled", "lag_network"}
 # Cells of the records that miss a bar, as methods by benchmark and world, by the reason.
 _SHARP = "entropy_fixed_point, sharpest_phase"
 _PGA = "pga_sca, pga_sca:synchronised"

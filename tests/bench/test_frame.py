@@ -16,8 +16,11 @@ from torch import Tensor, nn
 from torchsar.cli import main
 from torchsar.compensate import Sca, autofocus, sharpest_phase
 from torchsar.core import Estimate
+from torchsar.metrics import phase_rmse
 from torchsar.study.bench import entrant, frame, methods, records, show
 from torchsar.study.bench.frame import Bench, Entry, World, scored
+from torchsar.study.bench.learned import networks, trained
+from torchsar.study.bench.scenes import Scenes
 
 WORLDS = methods.WORLDS
 SOME = [w for w in WORLDS if w.label in ("noise", "direct, 10 dB", "clutter 60 %, 5 dB", "lost pulses, 10 dB")]
@@ -246,3 +249,29 @@ def test_other_benchmarks_take_methods_of_users() -> None:
     run = entrant.entrant(lambda x: np.zeros(len(x)), "doppler_hz")
     rows = scored(one, [frame.in_worlds_of(replace(first, worlds=[world]), "zero", run)], 6)["zero"]
     assert 5 < rows["all"]["error"][0] < 60 and show.cells({"methods": {"zero": rows}})[0][0] == "method"
+
+
+def test_scenes_for_training_are_not_those_that_are_scored() -> None:
+    train, validation = (Scenes("autofocus", split, length=60, batch=1) for split in ("train", "validation"))
+    data, phase = train[30]
+    assert data.shape[:2] == phase.shape and len(train) == 60
+    world = train.worlds[30 % len(train.worlds)]
+    scored_data = world.blocks(1)[0].data.data
+    assert not torch.allclose(data, scored_data) and not torch.allclose(data, validation[30][0])
+    assert torch.equal(data, train[30][0])
+    with pytest.raises(ValueError, match="the splits 'train' and 'validation', got 'test'"):
+        Scenes("autofocus", "test")
+    with pytest.raises(ValueError, match="1 to 25 trials, got 26"):
+        Scenes("autofocus", batch=26)
+    with pytest.raises(IndexError):
+        train[60]
+
+
+@pytest.mark.parametrize("name", networks())
+def test_networks_follow_added_phases_and_stay_finite(name: str) -> None:
+    network = trained()[name]
+    (batch,) = SOME[1].blocks(2)
+    added = 6 * torch.rand(batch.data.data.shape[:-1], generator=torch.Generator().manual_seed(1))
+    moved = network(batch.data.data * torch.polar(torch.ones_like(added), added)[..., None])
+    assert float(phase_rmse(moved - added, network(batch.data.data)).max()) < 0.05
+    assert bool(network(torch.zeros(2, 32, 8, dtype=torch.complex64)).isfinite().all())

@@ -198,7 +198,7 @@ def marks(names: Sequence[str], series: Mapping[str, np.ndarray], xlabel: str, t
         reach = np.abs(np.stack(ends) - value)
         axes.errorbar(value, at, xerr=reach, fmt=MARKERS[i], color=COLOURS[i], markersize=4, linewidth=1, label=label)
     axes.set_yticks(-np.arange(len(names)), names)
-    axes.set(xlabel=xlabel, title=wrapped_title(title, ALONE))
+    axes.set(xlabel=xlabel, title=wrapped_title(title, 0.7 * ALONE))
     legend_below(figure, axes)
     return figure
 

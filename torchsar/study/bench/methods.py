@@ -89,7 +89,7 @@ def entries() -> list[Entry]:
         "textbook_pga": textbook_pga,
         "adam_entropy": adam_entropy,
         "uncorrected": uncorrected,
-        "learned": trained(),
+        **trained(),
     }
     plain = {name: entrant(method, "phase_rad", per_pulse=True) for name, method in simple.items()}
     return [Entry(name, run, WORLDS, PHASES) for name, run in {**stages, **plain}.items()]
