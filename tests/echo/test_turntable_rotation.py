@@ -308,7 +308,10 @@ REFUSED = {
         lambda: TurntableWorld(CUBES, 0.02, rotation=ROTATION),
         "rotation_rad_s=0.02 and a polynomial rotation are both given for the world; give one of them",
     ),
-    "type": (lambda: TurntableWorld(CUBES, rotation=0.02), "rotation must be a PolynomialRotation or None, got 0.02"),  # pyright: ignore[reportArgumentType]
+    "type": (
+        lambda: TurntableWorld(CUBES, rotation=0.02),
+        r"PolynomialRotation\(omega_rad_s\) or None, got 0.02",
+    ),  # pyright: ignore[reportArgumentType]
     "yc": (lambda: TurntableWorld(CUBES, centre_deviation_m=math.inf), "centre_deviation_m must be a finite number"),
     "turning back": (
         lambda: simulate_turntable(

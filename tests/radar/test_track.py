@@ -103,5 +103,7 @@ def test_a_simulation_flies_along_a_log(tmp_path: Path) -> None:
 
 
 def test_a_flight_takes_a_path_only() -> None:
-    with pytest.raises(TypeError, match=r"a Flight needs a path with position_m\(time_s\).*got str"):
+    with pytest.raises(
+        TypeError, match=r"nominal must be an object with position_m\(time_s\), such as Str.*got 'log.csv'"
+    ):
         scene.Flight("log.csv")  # pyright: ignore[reportArgumentType]

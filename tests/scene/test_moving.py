@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchsar.core import Draws
-from torchsar.radar import BistaticRadar, LinearFM
+from torchsar.radar import BistaticRadar, LinearFM, Orbit
 from torchsar.radar.bistatic import receive_range
 from torchsar.scene import (
     AlwaysLit,
@@ -158,7 +158,7 @@ def test_points_may_differ_between_trials_and_be_complex():
         (lambda: TaylorRange(3), "2, 4, 6"),
         (lambda: BandLimited(0.0), "positive number"),
         (lambda: PolynomialTransmit([1.0], 2), "0..1"),
-        (lambda: OrbitTransmit(None, (1.0, 2.0)), "three coordinates"),  # pyright: ignore[reportArgumentType]
+        (lambda: OrbitTransmit(Orbit(7e6), (1.0, 2.0)), "three coordinates"),
         (lambda: BistaticWorld(None, Pattern()), "empty"),
         (lambda: movers_of(Fleet({})), "at least one scene"),
     ],

@@ -66,7 +66,11 @@ MISTAKES = [
     ("stripmap", {"world": world("stripmap", doppler_hz=None, squint_deg=90.0)}, "between -90 and 90 degrees"),
     ("stripmap", {"world": world("stripmap", lines=1)}, "world needs at least 2 lines, got 1"),
     ("stripmap", alone({"stage": "omega_k", "doppler_hz": [1.0, 2.0]}), "doppler_hz' has the value [1.0, 2.0]"),
-    ("stripmap", alone({"stage": "compress_dechirped"}), "needs radar.pulse_s"),
+    (
+        "stripmap",
+        alone({"stage": "compress_dechirped"}),
+        "radar must be InverseRadar(carrier_hz, bandwidth_hz, prf_hz), got StripmapRadar",
+    ),
     # isal
     ("isal", {"world": world("isal", motion={"v": {**VIBRATION, "name": "1_100"}})}, "amplitude_frequency_phase"),
     (
@@ -94,12 +98,12 @@ MISTAKES = [
     (
         "isal",
         methods("isal", odd={"stages": {"doppler": {"stage": "doppler_centroid"}, "image": IMAGE}}),
-        "needs radar.velocity_m_s, which a radar of this system does not have",
+        "near_range_m), got InverseRadar",
     ),
     (
         "isal",
         methods("isal", odd={"stages": {"compress": {"stage": "range_compress"}, "image": IMAGE}}),
-        "processor.odd: this stage needs radar.pulse",
+        "compress: RangeCompress: radar must be StripmapRadar(",
     ),
     (
         "isal",
@@ -265,7 +269,7 @@ MISTAKES = [
         alone({"stage": "signal_intensity_ratio", "bandwidth_hz": 600.0}),
         "3 bands of 180 Hz leave nothing outside 600 Hz",
     ),
-    ("geo", alone({"stage": "omega_k"}), "a radar of this system does not have"),
+    ("geo", alone({"stage": "omega_k"}), "near_range_m), got BistaticRadar"),
     ("geo", {"metrics": {"reference": "recommended"}}, "metrics.reference"),
     # geo_ocean
     (

@@ -113,6 +113,7 @@ from torchsar.compensate.velocity import (
     EffectiveVelocity,
     minimum_entropy_velocity,
 )
+from torchsar.core.kinds import check_kinds
 
 __all__ = [
     "AlignEnvelopes",
@@ -187,3 +188,4 @@ __all__ = [
     "uneven_rotation",
 ]
 __dir__ = __all__.copy
+globals().update(check_kinds(globals()[name] for name in __all__))

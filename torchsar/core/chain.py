@@ -14,7 +14,7 @@ from torchsar.core.connect import Use, run_module
 from torchsar.core.draws import Draws
 from torchsar.core.estimate import Estimate
 from torchsar.core.host import gathered_checks
-from torchsar.core.show import Shown, Summary
+from torchsar.core.show import Shown, Summary, argument
 from torchsar.core.signal import Recording, Signal
 from torchsar.core.spread import Spread, spread_of
 from torchsar.core.trace import Given, Known, Log, Trace
@@ -53,17 +53,23 @@ class Chain(Shown, nn.Module):
     and shows in `neutral` where they were not used, and in `doubtful` where doubtful ones were.
 
     Args:
+        *unnamed: Refused, since a stage needs a name.
         **stages: Stages by name, in the order in which they run; `use` connects their parameters.
 
     Raises:
         ValueError: If there is no stage, if torch.nn.ModuleDict reserves a name, if a connection
             names an unknown parameter or a value that no earlier stage provides, or if a required
             parameter is not connected.
-        TypeError: If a stage is not a torch.nn.Module.
+        TypeError: If a stage has no name, or is not a torch.nn.Module.
     """
 
-    def __init__(self, **stages: nn.Module) -> None:
+    def __init__(self, *unnamed: object, **stages: nn.Module) -> None:
         super().__init__()
+        if unnamed:
+            raise TypeError(
+                f"a chain needs a name for each stage, such as Chain(focus=OmegaK(radar)), got {argument(unnamed[0])}; "
+                "Chain(**stages) takes a mapping of names"
+            )
         if not stages:
             raise ValueError(
                 "a chain needs at least one stage: Chain(compress=RangeCompress(radar), focus=OmegaK(radar))"

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torchsar.core.derivatives import Differentiable, without_derivatives
 from torchsar.core.estimate import Estimate
 from torchsar.core.host import check_value, checked_samples, gathered_checks, refuse_non_finite_values
+from torchsar.core.kinds import fitted
 from torchsar.core.show import argument
 from torchsar.core.signal import Signal
 
@@ -226,6 +227,9 @@ def _explained(init: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(init)
     def explained(self: Any, *args: Any, **kwargs: Any) -> None:
+        if type(self).__init__ is explained:
+            (_, *fit), kwargs = fitted(init, type(self).__name__, (self, *args), kwargs)
+            args = tuple(fit)
         try:
             init(self, *args, **kwargs)
         except (TypeError, AttributeError) as error:

@@ -33,6 +33,7 @@ true values of the impairment. The recording may be simulated or recorded. A par
 `Tensor | float` is a number, equal in all trials, or a tensor with one value per trial.
 """
 
+from torchsar.core.kinds import check_kinds
 from torchsar.echo.bistatic import bistatic_echo, simulate_bistatic
 from torchsar.echo.channel_errors import ChannelErrors, SynchronisationError
 from torchsar.echo.channels import ChannelImbalance
@@ -94,3 +95,4 @@ __all__ = [
     "turntable_echo",
 ]
 __dir__ = __all__.copy
+globals().update(check_kinds(globals()[name] for name in __all__))

@@ -36,6 +36,7 @@ Most functions are stages of chains, too: `OmegaK` calls `omega_k`, and so on. `
 `backproject_strip`, and `SpotlightBackprojection` calls `backproject_spotlight`.
 """
 
+from torchsar.core.kinds import check_kinds
 from torchsar.focus.backprojection import backproject
 from torchsar.focus.chirp_z import Keystone, chirp_z, keystone
 from torchsar.focus.coordinates import ClosestRange, PaddedLines, closest_range
@@ -162,3 +163,4 @@ __all__ = [
     "write_strip",
 ]
 __dir__ = __all__.copy
+globals().update(check_kinds(globals()[name] for name in __all__))

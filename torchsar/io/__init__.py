@@ -18,6 +18,7 @@ strip longer than memory             `StripImage`, `write_strip_geotiff`
 ===================================  ========================================================
 """
 
+from torchsar.core.kinds import check_kinds
 from torchsar.io.arrays import read_images
 from torchsar.io.cphd import read_cphd
 from torchsar.io.fmcw import fmcw_recording
@@ -55,3 +56,4 @@ __all__ = [
     "write_strip_geotiff",
 ]
 __dir__ = __all__.copy
+globals().update(check_kinds(globals()[name] for name in __all__))

@@ -24,6 +24,7 @@ bound of the errors of a path      `line_of_sight_bound_m`
 =================================  =================================================================
 """
 
+from torchsar.core.kinds import check_kinds
 from torchsar.metrics.bistatic_bounds import bistatic_bounds
 from torchsar.metrics.bounds import (
     beam_centre_bound_hz,
@@ -83,3 +84,4 @@ __all__ = [
     "velocity_segmented_bound_m_s",
 ]
 __dir__ = __all__.copy
+globals().update(check_kinds(globals()[name] for name in __all__))

@@ -77,13 +77,8 @@ def impulse_response(
         ValueError: If the signal does not have two axes, is not finite, or a position lies outside
             it, or if `sidelobe_nulls` is below 1 or `search_m` not positive.
     """
-    if not isinstance(signal, Signal) or len(signal.axes) != 2:
-        raise ValueError(
-            "impulse_response needs a Signal with two axes, got "
-            f"{signal.names if isinstance(signal, Signal) else type(signal).__name__}"
-        )
-    if len(at_m) != 2:
-        raise ValueError(f"at_m needs one coordinate for each of the axes {signal.names}, got {len(at_m)}")
+    if len(signal.axes) != 2:
+        raise ValueError(f"impulse_response needs a Signal with two axes, got {signal.names}")
     if sidelobe_nulls < 1 or (search_m is not None and not search_m > 0):
         raise ValueError(
             "impulse_response needs sidelobe_nulls of 1 or more and search_m above 0, got "

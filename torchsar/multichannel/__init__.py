@@ -35,6 +35,7 @@ azimuth image of a point           `focus_azimuth`; for one known motion `FocusP
 Most functions are stages of chains, too: `Reconstruct` calls `reconstruct`, and so on.
 """
 
+from torchsar.core.kinds import check_kinds
 from torchsar.multichannel.azimuth import (
     FocusAzimuth,
     focus_azimuth,
@@ -143,3 +144,4 @@ __all__ = [
     "stationary_image",
 ]
 __dir__ = __all__.copy
+globals().update(check_kinds(globals()[name] for name in __all__))

@@ -14,6 +14,7 @@ derivatives of a minimum          `implicit`
 The first three return a `Descent`, the searches a `Searched`.
 """
 
+from torchsar.core.kinds import check_kinds
 from torchsar.optim.descent import Descent, adam, lbfgs
 from torchsar.optim.newton import implicit, newton
 from torchsar.optim.search import Searched, differential_evolution, genetic, grid_search
@@ -30,3 +31,4 @@ __all__ = [
     "newton",
 ]
 __dir__ = __all__.copy
+globals().update(check_kinds(globals()[name] for name in __all__))

@@ -10,6 +10,7 @@ try:
 except ImportError as error:
     raise ImportError("torchsar.plot needs matplotlib: pip install 'torchsar-lab[study]'") from error
 
+from torchsar.core.kinds import check_kinds
 from torchsar.plot.curves import alike, curves, marks, panels, scatterers, trade
 from torchsar.plot.images import (
     boxes,
@@ -53,3 +54,4 @@ __all__ = [
     "within",
 ]
 __dir__ = __all__.copy
+globals().update(check_kinds(globals()[name] for name in __all__))

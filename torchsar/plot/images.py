@@ -363,6 +363,4 @@ def _draw_over(
 
 def _first(signal: Signal) -> Signal:
     """First trial of a signal."""
-    if not isinstance(signal, Signal):
-        raise TypeError(f"a picture needs a Signal, got {type(signal).__name__}; wrap a tensor: Signal(data, axes)")
     return signal.with_data(signal.data.flatten(0, -3)[0]) if signal.trials else signal

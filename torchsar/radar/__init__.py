@@ -23,6 +23,7 @@ speed of light                         `LIGHT_M_S`
 =====================================  ============================================================
 """
 
+from torchsar.core.kinds import check_kinds
 from torchsar.core.show import show_briefly
 from torchsar.radar.antenna_path import AntennaPath
 from torchsar.radar.bistatic import BistaticRadar
@@ -74,3 +75,4 @@ __all__ = [
 ]
 __dir__ = __all__.copy
 show_briefly(globals()[name] for name in __all__)
+globals().update(check_kinds(globals()[name] for name in __all__))

@@ -31,6 +31,7 @@ and `BlindJitter` are the stages of the estimators of jitter, and `EstimateRespo
 functions for the response.
 """
 
+from torchsar.core.kinds import check_kinds
 from torchsar.repair.channels import CorrectImbalance, EstimateImbalance, correct_imbalance, estimate_imbalance
 from torchsar.repair.constant import (
     BalanceQuadrature,
@@ -140,3 +141,4 @@ __all__ = [
     "zero_fill",
 ]
 __dir__ = __all__.copy
+globals().update(check_kinds(globals()[name] for name in __all__))

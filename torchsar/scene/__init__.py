@@ -38,6 +38,7 @@ A parameter annotated `Tensor | float` is a number, equal in all trials, or a te
 because they decide shapes or choose a model.
 """
 
+from torchsar.core.kinds import check_kinds
 from torchsar.core.show import show_briefly
 from torchsar.scene.aircraft import Aircraft, SpreadRows
 from torchsar.scene.bistatic import (
@@ -142,3 +143,4 @@ __all__ = [
 ]
 __dir__ = __all__.copy
 show_briefly(globals()[name] for name in __all__)
+globals().update(check_kinds(globals()[name] for name in __all__))

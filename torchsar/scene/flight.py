@@ -313,13 +313,6 @@ class Flight:
     nominal: NominalPath
     motion: Sway = field(default_factory=Sway)
 
-    def __post_init__(self) -> None:
-        if not callable(getattr(self.nominal, "position_m", None)) or not isinstance(self.motion, Sway):
-            raise TypeError(
-                "a Flight needs a path with position_m(time_s), such as StraightPath or RecordedPath, and a Sway, got "
-                f"{type(self.nominal).__name__} and {type(self.motion).__name__}"
-            )
-
     def drawn(self, draws: Draws, span_s: float) -> Flight:
         """Draw the random motions.
 

@@ -101,18 +101,9 @@ class LadarWorld:
     calibration: CalibrationFibre | None = None
 
     def __post_init__(self) -> None:
-        if not hasattr(self.scene, "scatterers"):
-            raise TypeError(f"scene must be an object with scatterers, such as Points or LetterE, got {self.scene!r}")
-        if hasattr(self.motion, "displacement_m") or hasattr(self.motion, "drawn"):
-            raise TypeError(f"motion must be a list of motions, got {self.motion!r}; put it in brackets")
         if self.gate_m is not None:
             sentence = "gate_m must be a pair (low, high) of relative ranges (m) with low < high"
             if not (isinstance(self.gate_m, tuple | list) and len(self.gate_m) == 2):
                 raise ValueError(f"{sentence}, got {self.gate_m}")
             low, high = self.gate_m
             refuse_unless(sentence, low, lambda x: x < high, f"high is {high}")
-        if isinstance(self.fidelity, type) or not hasattr(self.fidelity, "sweep_range_m"):
-            raise TypeError(
-                "fidelity must be LinearInSweep(), QuadraticInSweep(), EverySample(), OnePerSweep() "
-                f"or OnePerPeriod(), got {self.fidelity!r}"
-            )

@@ -242,13 +242,6 @@ class TurntableWorld:
     centre_deviation_m: Tensor | float = 0.0
 
     def __post_init__(self) -> None:
-        if not isinstance(self.fidelity, PhaseOnly | Dechirped):
-            raise TypeError(f"fidelity must be PhaseOnly() or Dechirped(), got {self.fidelity!r}")
-        if not isinstance(self.rotation, PolynomialRotation | None):
-            raise TypeError(
-                f"rotation must be a PolynomialRotation or None, got {self.rotation!r}; give a uniform rate "
-                "as rotation_rad_s"
-            )
         if self.rotation is not None and self.rotation_rad_s is not None:
             raise ValueError(
                 f"rotation_rad_s={self.rotation_rad_s} and a polynomial rotation are both given for the world; "

@@ -164,9 +164,6 @@ class Section:
         try:
             return self.target(**{**made, **{name: value for name, value in given.items() if "." not in name}})
         except (ValueError, TypeError) as error:
-            if isinstance(lacked := error.__cause__, AttributeError) and any(lacked.obj is x for x in context.values()):
-                # no key is wrong: an object of the context, such as a radar, lacks an attribute
-                raise
             text = one_line(error)
             raise ConfigError(f"{file}: {text if text.startswith(f'{where}.') else f'{where}: {text}'}") from None
 

@@ -239,7 +239,7 @@ class Bench:
         except Exception as error:  # a stage of the user may raise any error
             if is_out_of_memory(error):  # a smaller batch may succeed
                 raise
-            text = reason_of(error, self.radar)
+            text = reason_of(error)
             if name == "recommended" or os.environ.get("TORCHSAR_DEBUG"):
                 raise ConfigError(f"{self.file}: processor.{name}: {text}") from error
             log.warning("warning: %s failed: %s", name, text)
@@ -392,7 +392,7 @@ def _chain(loaded: Loaded, method: Method, where: str, context: Mapping[str, Any
         except ConfigError:
             raise
         except Exception as error:  # a stage of the user may raise any error
-            raise ConfigError(f"{loaded.file}: {path}: {reason_of(error, context.get('radar'))}") from error
+            raise ConfigError(f"{loaded.file}: {path}: {reason_of(error)}") from error
         built[name] = use(
             stage,
             in_doubt=entry.get("in_doubt", "apply"),
@@ -421,21 +421,15 @@ def _checked_sources(entry: Mapping[str, Any], method: Method, loaded: Loaded, w
     return uses
 
 
-def reason_of(error: Exception, radar: Any) -> str:
+def reason_of(error: Exception) -> str:
     """Return the reason why a stage failed.
 
     Args:
         error: The error of the stage.
-        radar: The radar that it was given.
 
     Returns:
         The text of the error in one line, with its kind where the text alone may say too little.
     """
-    if isinstance(missing := error.__cause__ or error, AttributeError) and radar is not None and missing.obj is radar:
-        return (
-            f"this stage needs radar.{missing.name}, which a radar of this system does not have; use a stage of this "
-            "system"
-        )
     if isinstance(error, _PLAIN) and one_line(error):
         return one_line(error)
     return f"{type(error).__name__}: {one_line(error) or 'no message'}{own_line(error)}"
