@@ -1,6 +1,7 @@
 # make run: the embedded experiment. make test: the quick tests, in JOBS processes of one thread;
 # make test-slow: those marked slow; TESTS chooses files. All set up $(VENV) first.
 # make docs: the documentation site, in docs/_build/html; it works without a network.
+# make notebooks: the tutorials as executed notebooks, in docs/_build/notebooks.
 # make package: sdist and wheel, and the wheel used outside the repository as its users do.
 # An environment that already has torch keeps it: make run VENV=/path/to/venv
 VENV   ?= .venv
@@ -21,7 +22,7 @@ STAMP := $(VENV)/.torchsar-installed
 # Bytecode is kept: otherwise every worker, and every process that a test starts, compiles all files again.
 PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(PY) -m pytest -n $(JOBS) --dist worksteal
 
-.PHONY: run test test-slow lint docs docs-install package install clean
+.PHONY: run test test-slow lint docs docs-install notebooks package install clean
 
 run: install
 	$(VENV)/bin/torchsar run $(CONFIG) $(ARGS) --out $(OUT)
@@ -42,6 +43,9 @@ docs-install: install
 docs: docs-install
 	$(PY) -m sphinx -W --keep-going -n -q docs docs/_build/html
 	@echo 'the documentation is in docs/_build/html/index.html'
+
+notebooks: install
+	OMP_NUM_THREADS=1 $(PY) scripts/notebooks.py $(ARGS)
 
 package: install
 	VENV=$(VENV) .ci/package
