@@ -87,13 +87,25 @@ def _images(zarr: Any, group: Any, name: str) -> Iterator[tuple[str, Signal]]:
     """Yield the names and the images of a group and of all groups below it."""
     image = group.get("image")
     if isinstance(image, zarr.Array):
-        held = [(axis, group[axis]) for axis in image.metadata.dimension_names]
-        axes = (Axis(axis, x.shape[0], float(x[0]), float(x.attrs["step"]), str(x.attrs["unit"])) for axis, x in held)
         refuse_missing_chunks(image)
         refuse_beyond_memory(image.name, image.shape, image.dtype)
-        yield name, Signal(torch.from_numpy(image[...]), tuple(axes))
+        yield name, Signal(torch.from_numpy(image[...]), axes_of(group, image))
     for below, inner in sorted(group.groups()):
         yield from _images(zarr, inner, f"{name}/{below}".strip("/"))
+
+
+def axes_of(group: Any, image: Any) -> tuple[Axis, ...]:
+    """Return the axes of an image.
+
+    Args:
+        group: Open zarr group with the coordinates of the axes.
+        image: Array of the group.
+
+    Returns:
+        The axes, in the order of the dimensions.
+    """
+    held = [(name, group[name]) for name in image.metadata.dimension_names]
+    return tuple(Axis(name, x.shape[0], float(x[0]), float(x.attrs["step"]), str(x.attrs["unit"])) for name, x in held)
 
 
 def seal_files(root: Any, path: Path, free: str = "", **attributes: Any) -> None:

@@ -14,7 +14,7 @@ import torch
 
 from torchsar.core import Axis, Recording, Signal
 from torchsar.focus.detection import QuickLook
-from torchsar.io.arrays import WRITE_ALL, put, refuse_changed_files, refuse_missing_chunks, seal_files
+from torchsar.io.arrays import WRITE_ALL, axes_of, put, refuse_changed_files, refuse_missing_chunks, seal_files
 from torchsar.io.extras import library, reading
 from torchsar.io.fields import Level, archive, naming
 from torchsar.io.recorded import describe_stripmap
@@ -164,11 +164,7 @@ class StripImage:
             self.identity, self.about = held["identity"], held["about"]
             self._blocks: dict[str, list[int]] = held["blocks"]
             self.array: Any = self._root["image"].with_config(WRITE_ALL)
-            self.axes = tuple(self._axis(name) for name in self.array.metadata.dimension_names)
-
-    def _axis(self, name: str) -> Axis:
-        held = self._root[name]
-        return Axis(name, held.shape[0], float(held[0]), float(held.attrs["step"]), str(held.attrs["unit"]))
+            self.axes = axes_of(self._root, self.array)
 
     @staticmethod
     def is_begun(path: str | Path) -> bool:

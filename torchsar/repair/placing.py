@@ -78,7 +78,10 @@ class LinePlan:
         lost = rows - len(time.round().unique())
         if lost > 0:
             at = int((time.diff() > 1.5).int().argmax())
-            notes.append(f"{lost} of {rows} lines are missing, the first after line {at}, and are set to zero")
+            notes.append(
+                f"{lost} of {rows} lines are missing, the first after line {at}; they are zero until a stage, such as "
+                "sparse_fill, fills them"
+            )
         uneven = float((time - time.round()).abs().max())
         if uneven >= 1e-3:
             notes.append(f"times of lines lie up to {uneven:.2g} pulse intervals beside the grid and are interpolated")
