@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from torchsar.core import Axis, Chain, Estimate, Signal, Stage
+from torchsar.core import Axis, Chain, Estimate, Signal, Stage, use
 
 AXES = Axis("pulse", 4, 0.0, 0.1, "s"), Axis("range", 3, 0.0, 1.0, "m")
 SIGNAL = Signal(torch.ones(2, 4, 3, dtype=torch.complex64), AXES)
@@ -87,3 +87,37 @@ class Pairs(Stage):
 def test_a_tuple_that_is_no_signal_with_estimate_is_named(make: Callable[[Signal], tuple], said: str) -> None:
     with pytest.raises(TypeError, match=rf"stage 'pair' \(Pairs\) returned {said}; a stage returns a Signal"):
         Chain(pair=Pairs(make))(SIGNAL)
+
+
+class Mean(torch.nn.Module):
+    """Estimator that is no stage."""
+
+    provides = ("level",)
+
+    def forward(self, signal):
+        return Estimate({"level": signal.data.abs().mean(signal.dim("pulse")).mean(-1)})
+
+
+class Uses(Stage):
+    """Takes a level."""
+
+    def forward(self, signal: Signal, level: torch.Tensor) -> Signal:
+        return signal.with_data(signal.data * level[..., None, None])
+
+
+def test_a_module_that_provides_values_gets_the_signal() -> None:
+    data = torch.full((2, 4, 3), 2.0 + 0j, requires_grad=True)
+    out = Chain(mean=Mean(), uses=use(Uses(), level="mean"))(Signal(data, AXES))
+    out.data.real.sum().backward()
+    assert out.data.real.unique().tolist() == [4.0]
+    # the derivative of the level is not cut
+    torch.testing.assert_close(data.grad, torch.full_like(data, 4.0))
+
+
+def test_a_module_without_provides_is_named() -> None:
+    silent = type("Silent", (torch.nn.Module,), {"forward": Mean.forward})
+    with pytest.raises(ValueError, match=r"no earlier stage provides \(stage 'mean' lacks the attribute `provides`"):
+        Chain(mean=silent(), uses=use(Uses(), level="mean"))
+    with pytest.raises(TypeError, match="dim") as caught:
+        Chain(mean=silent())(SIGNAL)
+    assert caught.value.__notes__ == ["stage 'mean' (Silent), which is no Stage, was given a Tensor"]

@@ -39,8 +39,9 @@ class Chain(Shown, nn.Module):
     Connections made by `use` are checked when the chain is built.
 
     Modules that are no stages of torchsar work too, such as a torch.nn.Sequential: they get the
-    samples as a tensor and return samples of the same shape. If the first parameter of `forward` is
-    annotated with `Signal`, they get the signal as stages do.
+    samples as a tensor and return samples of the same shape. If they have the attribute `provides`,
+    as an estimator has, or the first parameter of `forward` is annotated with `Signal`, they get
+    the signal as stages do.
 
     A chain may begin with the world and end with numbers: `echo.Simulate` makes the recording, so
     that the chain is called with random draws in its place (`chain(draws=Draws(1))`);
@@ -108,8 +109,11 @@ class Chain(Shown, nn.Module):
                         f"`forward` accepts {accepted or 'none'}"
                     )
                 if not source.startswith(("aux.", "given.", "truth.")) and source not in available:
+                    maker, _, value = source.partition(".")
+                    silent = maker in self.stages and not _provided(self.stages[maker])
+                    lacks = f" (stage {maker!r} lacks the attribute `provides`, such as ({value!r},))" if silent else ""
                     raise ValueError(
-                        f"stage {name!r} uses {source!r}, which no earlier stage provides; available are "
+                        f"stage {name!r} uses {source!r}, which no earlier stage provides{lacks}; available are "
                         f"{sorted(available) or 'nothing yet'}, 'aux.NAME' for recorded side data, 'truth.NAME' for "
                         "true values, and 'given.NAME' for values given to the chain"
                     )

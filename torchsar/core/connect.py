@@ -87,8 +87,9 @@ def run_module(name: str, stage: nn.Module, signal: Signal, arguments: Mapping[s
 
     Args:
         name: Name of the stage in the chain.
-        stage: The module. Unless it belongs to torchsar, or the first parameter of its `forward` is
-            annotated with `Signal`, it gets samples and returns samples.
+        stage: The module. Unless it belongs to torchsar, has names of values in `provides`, or the
+            first parameter of its `forward` is annotated with `Signal`, it gets samples and returns
+            samples.
         signal: Signal before the stage.
         arguments: Further values by the names of parameters.
 
@@ -97,10 +98,18 @@ def run_module(name: str, stage: nn.Module, signal: Signal, arguments: Mapping[s
 
     Raises:
         ValueError: If samples have another shape than those of the signal.
+        Exception: What the module raises; a note says what a module that is no stage was given.
     """
-    if not _takes_samples(type(stage)):
+    if not _is_foreign(type(stage)):
         return stage(signal, **arguments)
-    result = stage(signal.data, **arguments)
+    given = signal if getattr(stage, "provides", ()) or _takes_signal(type(stage)) else signal.data
+    try:
+        result = stage(given, **arguments)
+    except Exception as error:
+        error.add_note(
+            f"stage {name!r} ({type(stage).__name__}), which is no Stage, was given a {type(given).__name__}"
+        )
+        raise
     if not isinstance(result, Tensor):
         return result
     if result.shape != signal.shape:
@@ -112,9 +121,13 @@ def run_module(name: str, stage: nn.Module, signal: Signal, arguments: Mapping[s
 
 
 @functools.cache
-def _takes_samples(kind: type[nn.Module]) -> bool:
-    """True if modules of this class get samples instead of a signal; see `run_module`."""
-    if any(base.__module__.startswith("torchsar.") for base in kind.__mro__):
-        return False
+def _is_foreign(kind: type[nn.Module]) -> bool:
+    """True for a class that does not derive from one of torchsar."""
+    return not any(base.__module__.startswith("torchsar.") for base in kind.__mro__)
+
+
+@functools.cache
+def _takes_signal(kind: type[nn.Module]) -> bool:
+    """True if the first parameter of `forward` is annotated with `Signal`."""
     first = list(inspect.signature(kind.forward).parameters.values())[1:2]
-    return not any("Signal" in str(parameter.annotation) for parameter in first)
+    return any("Signal" in str(parameter.annotation) for parameter in first)
