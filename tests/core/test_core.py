@@ -205,3 +205,17 @@ def test_take_and_best_of_choose_per_trial():
     assert best.tolist() == [20.0, 11.0] and margin.tolist() == [1.0, 0.5]
     x = torch.arange(24.0).reshape(2, 3, 4)
     assert take(x, torch.tensor([2, 0]), dim=1).tolist() == [[8, 9, 10, 11], [12, 13, 14, 15]]
+
+
+def test_a_recording_of_trials_is_indexed_with_its_side_data():
+    axes = Axis("pulse", 4, 0.0, 0.1, "s"), Axis("range", 3, 0.0, 1.0, "m")
+    aux = {"line_number": torch.arange(4), "place_m": torch.arange(24.0).view(2, 4, 3), "trigger_s": torch.arange(2.0)}
+    recording = Recording(Signal(torch.arange(24.0).view(2, 4, 3), axes), None, aux)
+    one = recording[1]
+    assert torch.equal(one.signal.data, recording.signal.data[1]) and torch.equal(one.aux["place_m"], aux["place_m"][1])
+    assert torch.equal(one.aux["line_number"], aux["line_number"]) and one.aux["trigger_s"] == 1
+    with pytest.raises(IndexError, match="chooses trials"):
+        one[0]
+    alike = Recording(Signal(torch.zeros(4, 4, 3), axes), None, {"line_number": torch.arange(4)})
+    with pytest.raises(ValueError, match="aux.line_number of shape .4,. may have an entry for each of the 4 trials"):
+        alike[0]

@@ -378,6 +378,8 @@ class Recording(Shown):
       pulse: 4, 0 to 0.03 s
       range: 8, -1.19917 to 0.899377 m)
 
+    `recording[0]` is the recording of the first trial, with its side data.
+
     Args:
         signal: Raw samples with their axes.
         radar: Description of the instrument (carrier, waveform, nominal path), such as a
@@ -450,6 +452,25 @@ class Recording(Shown):
             x = x * (10 ** (level / 20)).to(x.real.dtype)[..., None]
         refuse_non_finite(x, f"{what}, converted to {dtype}", _ADVICE)
         return cls(Signal(x, radar.raw_axes(x.shape[-2], x.shape[-1], start_s)), radar, side)
+
+    def __getitem__(self, index: Any) -> Recording:
+        """Choose trials of the samples and of the side data that have trials, as `recording[0]`.
+
+        Raises:
+            IndexError: If the signal has fewer trial dimensions, or fewer trials.
+            ValueError: If the shape of side data does not tell whether they have trials.
+        """
+        signal, trials = self.signal[index], self.signal.trials
+        aux = dict(self.aux)
+        for name, value in self.aux.items():
+            if value.shape[: len(trials)] == trials:
+                if value.ndim <= 2 and tuple(trials) in {(axis.n,) for axis in self.signal.axes}:
+                    raise ValueError(
+                        f"aux.{name} of shape {tuple(value.shape)} may have an entry for each of the {trials[0]} "
+                        "trials, or for each sample of an axis of this length; choose from both yourself"
+                    )
+                aux[name] = value[index]
+        return replace(self, signal=signal, aux=aux)
 
     def to(self, *args: Any, **kwargs: Any) -> Recording:
         """Return the recording on another device or in another dtype; arguments as for Tensor.to.

@@ -241,7 +241,7 @@ class SpotlightImage(TileImage):
         if known["path_reference_m"].ndim != 1:
             raise ValueError(
                 "the side data of a spotlight image must have no trials, got path_reference_m of shape "
-                f"{tuple(known['path_reference_m'].shape)}; select one trial"
+                f"{tuple(known['path_reference_m'].shape)}; select one trial: recording[0]"
             )
         antennas = AntennaPath(known["transmitter_m"], known.get("receiver_m"), known["path_reference_m"])
         grid = scene_grid(known["frequency_hz"], antennas, side_data.get("scene_corners_m"), centre_m)
