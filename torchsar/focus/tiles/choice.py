@@ -17,7 +17,7 @@ from torchsar.focus.tiles.kernels import (
     window_error,
     window_length,
 )
-from torchsar.focus.tiles.scene import Sampled, Scene, some_of
+from torchsar.focus.tiles.scene import TILES_OF_ZONE, Sampled, Scene, some_of
 
 # Number of pulses in one product of the spreading, by choice. Products of fewer pulses are slow,
 # those of more have more zeros.
@@ -218,7 +218,7 @@ def _sizes(scene: Scene, error_db: float, images: float) -> list[tuple[float, tu
     the window are those for half of the error, which is usual. The factors in ns were fitted to the
     times of 13 plans on one core. They apply per sample of a window or of its spectrum, per flop of
     a product, per element of the expansion, and per tile. Small images take more, because of the
-    calls of each group of tiles, and the first image computes the tables.
+    calls of each group of tiles, and the first image computes tables and matrices.
     """
     grid, (low, _, high) = scene.grid, scene.waves
     usual, per_metre, share = (
@@ -256,5 +256,7 @@ def _sizes(scene: Scene, error_db: float, images: float) -> list[tuple[float, tu
             time += parts * tiles * (length * width * MOMENTS * (order + 1) * 2.1 + 3000)
             calls = parts * math.ceil(tiles / GROUP) * across * along
             image_s, tables_s = 2e-9 * time + 1.5e-3 * calls, 3e-9 * time + 5e-3 * calls
+            # matrices that all tiles of a zone share
+            tables_s += 30e-9 * parts * math.ceil(tiles / TILES_OF_ZONE) * MOMENTS * length * width * nodes * across
             found.append((image_s + tables_s / images, (width, depth, parts, order)))
     return sorted(found)

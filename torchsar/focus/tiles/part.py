@@ -218,13 +218,21 @@ class Part:
         values = node_values((s - self.low) / self.node_step, self.nodes, self.choice.taps) / self.length
         constant, path = self.expansion.common_phase(s[:, None], self.x)  # (sample, x)
         per_wave = path / (self.length * self.band.step_m)
+        # The phase is linear in the wave number. The phasors are computed at as many Chebyshev
+        # points as their largest phase from the middle needs for -140 dB, and interpolated.
+        waves = torch.arange(self.length, dtype=torch.float64, device=self.centre.device) - self.length // 2
+        half = math.pi * self.length * float(per_wave.abs().max())
+        known, to_waves = interpolation(waves, math.ceil(half + 5 * half ** (1 / 3) + 8))
         # double precision is needed, because the matrix has large values of both signs
-        phasor = _ramp(constant / _TURN - self.length // 2 * per_wave, per_wave, self.length, torch.complex128)
+        phasor = unit_phasor((constant / _TURN)[..., None] + per_wave[..., None] * known, torch.complex128)
         moments = torch.cat([values * s**power for power in range(MOMENTS)])
         found = moments @ torch.view_as_real(phasor).reshape(len(s), -1)
-        found = torch.view_as_complex(found.view(MOMENTS, self.nodes, len(self.x), self.length, 2))
-        found = found.permute(0, 3, 1, 2)[:, :, None] * self.of_x.mT[:, None]  # (moment, wave number, point, node, x)
-        return list(found.to(dtype).flatten(2, 3).contiguous())
+        few = found.view(-1, len(self.x), len(known), 2).permute(2, 0, 1, 3).flatten(1).to(real_dtype(dtype))
+        every = torch.view_as_complex((to_waves.to(few.dtype) @ few).view(-1, MOMENTS, self.nodes, len(self.x), 2))
+        if len(self.of_x.mT) > 1:
+            # (wave number, moment, point along x * node, x)
+            every = (every[:, :, None] * self.of_x.mT[:, None].to(few.dtype)).flatten(2, 3)
+        return [one.contiguous() for one in every.unbind(1)]
 
     @untraced()
     def weights(self, rows: slice, dtype: torch.dtype, height_m: Tensor | None = None) -> Weights:

@@ -6,6 +6,7 @@ import copy
 import math
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -118,7 +119,7 @@ class Sector:
             scene = replace(scene, grid=grid)
         self._scene = scene
         # the tables of the choice are on the host, independently of the default device
-        with torch.device("cpu"):
+        with nullcontext() if torch.get_default_device().type == "cpu" else torch.device("cpu"):
             self.choice = choice = choose(scene, self.error_db, self._images)
         self._size = size = choice.width, choice.depth
         self._band = Band.of(self.frequency_hz, LIGHT_M_S, choice.oversampling)
