@@ -70,6 +70,9 @@ LIMITS: dict[str, dict[tuple[str, str], str]] = {
     },
     "a vehicle that moves on its own and is 5 dB stronger than the scene: its phases are found, and not those of the "
     "scene": {("autofocus", "vehicle 5 dB, 10 dB"): "autofocus, phase_polish"},
+    "a vehicle that moves on its own in clutter of the same power: its range cells are few among many": {
+        ("autofocus", "vehicle in clutter, 10 dB"): "link_phases"
+    },
     "a gap of a fifth of the pulses: the phases of its two sides may differ by a constant, which the deviation lacks": {
         ("autofocus", "gap, 10 dB"): "sca, entropy_fixed_point, phase_polish"
     },

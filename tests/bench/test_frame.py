@@ -242,6 +242,15 @@ def test_an_unknown_benchmark_gets_one_sentence(capsys: pytest.CaptureFixture[st
     assert "there is no benchmark 'weather'; choose one of autofocus, alignment, doppler" in capsys.readouterr().err
 
 
+def test_words_name_methods_records_and_worlds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "of_mine.py").write_text("def zero(x):\n    return 0 * x.real.mean(-1)\n")
+    words = ["pga_sca:synchronised", "PhaseIncrement=of_mine:zero", "recorded", "a.json"]
+    theirs, files = records.methods_of(words)
+    assert files == ["recorded", "a.json"] and theirs["pga_sca:synchronised"] is None
+    assert theirs["PhaseIncrement=of_mine:zero"].__name__ == "zero"
+
+
 def test_other_benchmarks_take_methods_of_users() -> None:
     one = records.bench("doppler")
     first = one.entries()[0]
