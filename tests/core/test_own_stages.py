@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -66,13 +67,13 @@ def test_a_wrong_argument_is_what_the_error_says() -> None:
 
 
 class Pairs(Stage):
-    """Returns a tuple that a test makes."""
+    """Returns what a test makes."""
 
-    def __init__(self, make: Callable[[Signal], tuple]) -> None:
+    def __init__(self, make: Callable[[Signal], Any]) -> None:
         super().__init__()
         self.make = make
 
-    def forward(self, signal: Signal) -> tuple:
+    def forward(self, signal: Signal) -> Any:
         return self.make(signal)
 
 
@@ -82,9 +83,10 @@ class Pairs(Stage):
         (lambda x: (x, x), r"\(Signal, Signal\)"),
         (lambda x: (x, None, 3), r"\(Signal, NoneType, int\)"),
         (lambda x: (x, (x,)), r"\(Signal, \(Signal\)\)"),
+        (lambda x: {"level": 1}, r"\{level: int\}"),
     ],
 )
-def test_a_tuple_that_is_no_signal_with_estimate_is_named(make: Callable[[Signal], tuple], said: str) -> None:
+def test_what_no_stage_returns_is_named(make: Callable[[Signal], Any], said: str) -> None:
     with pytest.raises(TypeError, match=rf"stage 'pair' \(Pairs\) returned {said}; a stage returns a Signal"):
         Chain(pair=Pairs(make))(SIGNAL)
 

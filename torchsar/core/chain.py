@@ -406,7 +406,7 @@ class Chain(Shown, nn.Module):
             return recording.signal
         assert signal is not None
         result = run_module(name, stage, signal, arguments)
-        if isinstance(result, Mapping):
+        if isinstance(result, Mapping) and all(isinstance(value, Tensor) for value in result.values()):
             known.metrics |= {f"{name}.{key}" if key else name: value for key, value in result.items()}
             return signal
         out, estimate = result if isinstance(result, tuple) and len(result) == 2 else (result, None)
@@ -415,7 +415,7 @@ class Chain(Shown, nn.Module):
         if not isinstance(out, Signal) or not isinstance(estimate, Estimate | None):
             raise TypeError(
                 f"stage {name!r} ({type(stage).__name__}) returned {_kinds(result)}; a stage "
-                "returns a Signal, an Estimate, (Signal, Estimate), or metrics by name"
+                "returns a Signal, an Estimate, (Signal, Estimate), or metrics, tensors by name"
             )
         if estimate is not None:
             known.add(name, estimate)
@@ -427,7 +427,9 @@ class Chain(Shown, nn.Module):
 
 
 def _kinds(result: Any) -> str:
-    """Name of the type of a result, or of those of the members of a tuple."""
+    """Name of the type of a result, or of those of the members of a tuple or mapping."""
+    if isinstance(result, Mapping):
+        return f"{{{', '.join(f'{key}: {_kinds(value)}' for key, value in result.items())}}}"
     return f"({', '.join(map(_kinds, result))})" if isinstance(result, tuple) else type(result).__name__
 
 
