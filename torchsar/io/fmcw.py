@@ -47,7 +47,7 @@ def fmcw_recording(
 
     Args:
         beat: Samples, complex (sweep, sample) or (sweep, receiver, sample); or integers with a last
-            dim of I and Q.
+            dim of I and Q; or, with the order "real", the real samples of a mixer without Q.
         start_hz: Frequency at the start of a sweep in Hz.
         slope_hz_s: Slope of the sweep in Hz/s, negative if the frequency falls.
         sampling_hz: Sampling rate in Hz.
@@ -56,7 +56,9 @@ def fmcw_recording(
             (receiver, 3) or (3,); None if both share an antenna.
         delay_s: Time from the start of a sweep to its first sample in seconds.
         prf_hz: Rate of the sweeps in Hz.
-        order: Order of I and Q, if they are a dim, such as "iiqq".
+        order: Order of I and Q, if they are a dim, such as "iiqq"; "real" for samples without Q, of
+            which the analytic signal is taken: delays end at half of the inverse of the frequency
+            step, and targets within a few range cells of range zero are disturbed.
         beat_sign: 1 if the phase of an echo grows with its delay, as of a mixer that gives
             transmitted times conjugate received signal; else -1.
 
@@ -70,10 +72,15 @@ def fmcw_recording(
         ValueError: If shapes do not fit, a number is not plausible, or a sample is not finite.
     """
     x = np.asarray(beat)
-    if x.dtype.kind != "c":
+    if order == "real" and x.dtype.kind != "c":
+        # the frequencies of a cosine have both signs, of which those of delays above zero are kept
+        x, beat_sign = _analytic(x), 1
+        x = x.conj() if slope_hz_s < 0 else x
+    elif x.dtype.kind != "c":
         if x.shape[-1:] != (2,):
             raise ValueError(
-                f"beat must be complex, or real with a last dim of I and Q, got {x.dtype} of shape {x.shape}"
+                f"beat must be complex, real with a last dim of I and Q, or real with order='real', got {x.dtype} of "
+                f"shape {x.shape}"
             )
         x = joined(*parted(x, order))
     place = torch.as_tensor(np.asarray(position_m, float))
@@ -108,3 +115,12 @@ def fmcw_recording(
         radar = replace(radar, pulse_s=n / sampling_hz)
     aux: dict[str, Any] = {"frequency_hz": frequency, **antennas.side_data()}
     return Recording.from_arrays(profiles, radar, what="beat", **aux)
+
+
+def _analytic(x: np.ndarray) -> np.ndarray:
+    """Analytic signal of real samples along the last dim."""
+    n = x.shape[-1]
+    spectrum = np.fft.fft(x.astype(float))
+    spectrum[..., 1 : (n + 1) // 2] *= 2
+    spectrum[..., n // 2 + 1 :] = 0
+    return np.fft.ifft(spectrum)
