@@ -10,6 +10,7 @@ import argparse
 import re
 import shutil
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import nbformat
 from jupyter_client.manager import AsyncKernelManager
@@ -55,9 +56,10 @@ def main() -> None:
         made = notebook(pages[name])
         for picture in re.findall(r"!\[[^\]]*\]\(([^)]*)\)", "".join(c.source for c in made.cells)):
             shutil.copy(DOCS / picture, given.out)
-        kernel = AsyncKernelManager(kernel_name="python3", transport="ipc")  # no port is opened
-        where = {"metadata": {"path": str(given.out)}}
-        NotebookClient(made, km=kernel, timeout=600, startup_timeout=300, resources=where).execute()
+        with TemporaryDirectory() as folder:  # files in it take the place of ports
+            kernel = AsyncKernelManager(transport="ipc", connection_file=f"{folder}/kernel.json")
+            where = {"metadata": {"path": str(given.out)}}
+            NotebookClient(made, km=kernel, timeout=600, startup_timeout=300, resources=where).execute()
         nbformat.write(made, given.out / f"{name}.ipynb")
         print(given.out / f"{name}.ipynb", flush=True)
 

@@ -25,7 +25,7 @@ def test_a_notebook_holds_the_page_and_what_it_prints(name: str, tmp_path: Path)
     nbformat = pytest.importorskip("nbformat", reason="the extra `notebooks` is not installed")
     pytest.importorskip("nbclient", reason="the extra `notebooks` is not installed")
     script = [sys.executable, str(ROOT / "scripts" / "notebooks.py"), name, "--out", str(tmp_path)]
-    done = subprocess.run(script, capture_output=True, text=True, cwd=tmp_path, timeout=300)
+    done = subprocess.run(script, capture_output=True, text=True, cwd=ROOT, timeout=300)
     assert done.returncode == 0, done.stderr
     made = nbformat.read(tmp_path / f"{name}.ipynb", as_version=4)
     nbformat.validate(made)

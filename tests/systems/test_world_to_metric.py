@@ -231,6 +231,7 @@ def test_what_a_config_measures_are_metrics_of_the_method(tmp_path: Path) -> Non
     measured = {
         "entropy": {"stage": "measure", "metric": "entropy"},
         "error": {"stage": "measure", "metric": "phase_rmse", "uses": error},
+        "point": {"stage": "measure", "metric": "impulse_response", "at_m": [0.0, 0.0]},
     }
     tree = {"title": "measured", "system": "isal", "radar": radar, "world": {**world, "noise": {"snr_db": 20.0}}}
     tree["processor"] = {"recommended": {"stages": {**stages, **measured}}}
@@ -240,6 +241,7 @@ def test_what_a_config_measures_are_metrics_of_the_method(tmp_path: Path) -> Non
     metrics = bench.batch(bench.draws("run", range(3)), detail=True).outcomes["recommended"].metrics
     assert torch.equal(metrics["entropy"], metrics["entropy_nats"])
     torch.testing.assert_close(metrics["error"], metrics["residual_phase_rms_rad"])
+    assert bool((metrics["point.irw_range_m"] > 0).all()) and bool((metrics["point.peak"] > 0).all())
     # other stages may not use true values
     tree["processor"]["recommended"]["stages"]["correct"]["uses"] = {"phase_rad": "truth.start.phase_rad"}
     file.write_text(yaml.safe_dump(tree, sort_keys=False), encoding="utf-8")

@@ -263,8 +263,19 @@ def movers_image(
 
 
 def measure(
-    metric: Literal["contrast", "correlation", "entropy", "phase_rmse", "residual_phase", "strehl"],
+    metric: Literal[
+        "contrast",
+        "correlation",
+        "entropy",
+        "error_db",
+        "impulse_response",
+        "phase_rmse",
+        "registered_error_db",
+        "residual_phase",
+        "strehl",
+    ],
     of: Literal["intensity", "amplitude"] | None = None,
+    at_m: tuple[float, float] | None = None,
 ) -> Measure:
     """Metric at its place in a chain; see `torchsar.metrics.Measure`.
 
@@ -274,8 +285,9 @@ def measure(
     Args:
         metric: Function of `torchsar.metrics`. Its parameters after the image are connected.
         of: Samples that contrast and entropy judge; None for the intensity.
+        at_m: Place on the axes of the image near which `impulse_response` measures.
     """
-    return Measure(getattr(metrics, metric), **({} if of is None else {"of": of}))
+    return Measure(getattr(metrics, metric), **{k: x for k, x in (("of", of), ("at_m", at_m)) if x is not None})
 
 
 def drift(velocity_m_s: Tensor | float = 0.0, acceleration_m_s2: Tensor | float = 0.0) -> Polynomial:

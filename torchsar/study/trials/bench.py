@@ -250,7 +250,10 @@ class Bench:
             for stage, e in estimates.items()
         }
         spent = torch.full((trials.count,), sum(seconds.values()) / trials.count, dtype=torch.float64)
-        measured = {key: rows(x.detach(), trials.count).double().mean(1) for key, x in trace.metrics.items()}
+        measured = {
+            key: rows(x.abs() if x.is_complex() else x, trials.count).detach().double().mean(1)
+            for key, x in trace.metrics.items()
+        }
         judged = replace(judged, metrics={"seconds": spent, **verdict(codes), **judged.metrics, **measured})
         left = [stage for stage in trace.inputs if trace.outputs[stage] is trace.inputs[stage]]
         used = {"neutral": trace.neutral, "doubtful": trace.doubtful}
