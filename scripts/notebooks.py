@@ -14,6 +14,7 @@ from tempfile import TemporaryDirectory
 
 import nbformat
 from jupyter_client.manager import AsyncKernelManager
+from jupyter_core.utils import run_sync
 from nbclient import NotebookClient
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -60,6 +61,7 @@ def main() -> None:
             kernel = AsyncKernelManager(transport="ipc", connection_file=f"{folder}/kernel.json")
             where = {"metadata": {"path": str(given.out)}}
             NotebookClient(made, km=kernel, timeout=600, startup_timeout=300, resources=where).execute()
+            run_sync(kernel.shutdown_kernel)(now=True)
         nbformat.write(made, given.out / f"{name}.ipynb")
         print(given.out / f"{name}.ipynb", flush=True)
 
