@@ -30,3 +30,30 @@ def test_what_functions_draw_stays_a_matplotlib_figure_or_a_list() -> None:
     panels = plot.images({"a": SIGNAL, "b": SIGNAL})
     assert isinstance(plot.image(SIGNAL), Figure)
     assert isinstance(panels, list) and all(isinstance(one, Figure) for one in panels)
+
+
+def test_a_response_has_both_cuts_with_width_and_side_lobes() -> None:
+    line = torch.sinc(torch.arange(-64.0, 64.0) / 2)
+    axes = Axis("azimuth", 128, -32.0, 0.5, "m"), Axis("range", 128, -128.0, 2.0, "m")
+    figures = plot.response(Signal(torch.outer(line, line) + 0j, axes), (0.0, 0.0))
+    for figure, name, width in zip(figures, ("azimuth", "range"), (0.886, 3.54), strict=True):
+        cut, mark = figure.axes[0].get_lines()
+        assert figure.axes[0].get_title() == f"{name}: PSLR -13.3 dB"
+        assert np.ptp(mark.get_xdata()) == pytest.approx(width, rel=5e-3) and f"{width:.3g}"[:3] in mark.get_label()
+        x, level = cut.get_xdata(), cut.get_ydata()
+        assert level.max() == pytest.approx(0, abs=1e-3) and len(x) > 128
+        assert np.interp(width / 2, x, level) == pytest.approx(-3, abs=0.1)
+
+
+def test_the_label_of_the_colours_fits_a_flat_image() -> None:
+    flat = Signal(torch.rand(24, 96), (Axis("azimuth", 24, 0.0, 1.0, "m"), Axis("range", 96, 0.0, 1.0, "m")))
+    for figure in (plot.image(flat), *plot.images({"a": flat, "b": flat})):
+        figure.canvas.draw()
+        label = figure.axes[1].yaxis.label
+        box = label.get_window_extent()
+        assert "percentile 99.9" in label.get_text() and box.y0 >= 0 and box.y1 <= figure.bbox.height
+
+
+def test_curves_have_limits_of_both_axes() -> None:
+    axes = plot.curves({"a": (np.arange(9.0), np.arange(9.0))}, "x", "y", ylim=(1, 2), xlim=(3, 4)).axes[0]
+    assert axes.get_xlim() == (3, 4) and axes.get_ylim() == (1, 2)

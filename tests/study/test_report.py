@@ -17,11 +17,11 @@ from tests.study.tiny import TINY, write_tiny
 from torchsar import plot
 from torchsar.cli import main
 from torchsar.core import Axis, Signal
+from torchsar.metrics.cuts import about_peak, finer, impulse_cuts
 from torchsar.metrics.image import rolled_to
 from torchsar.metrics.impulse import impulse_response
 from torchsar.study.output.numbers import number, quantity, scale_of
 from torchsar.study.output.report import draw_all, run_fields
-from torchsar.study.trials.cuts import about_peak, finer, impulse_cuts
 from torchsar.study.trials.system import Column
 
 # --- numbers
@@ -95,7 +95,7 @@ def test_images_in_metres_have_one_scale_unless_they_are_too_elongated() -> None
 
 
 def test_a_picture_of_a_tensor_is_refused_with_the_way_out() -> None:
-    with pytest.raises(TypeError, match=r"needs a Signal, got Tensor; wrap a tensor: Signal\(data, axes\)"):
+    with pytest.raises(TypeError, match=r"signal must be Signal\(data, axes\), got float32"):
         plot.image(torch.zeros(4, 4))  # type: ignore[arg-type]
 
 

@@ -62,6 +62,7 @@ def curves(
     title: str = "",
     marks: Mapping[str, float] | None = None,
     ylim: tuple[float, float] | None = None,
+    xlim: tuple[float, float] | None = None,
 ) -> Figure:
     """Draw curves into one panel.
 
@@ -74,11 +75,12 @@ def curves(
         title: Title of the panel.
         marks: Positions of vertical lines by name, in the unit of x.
         ylim: Limits of the vertical axis.
+        xlim: Limits of the horizontal axis.
 
     Returns:
         The figure.
     """
-    return curves_of(ALONE, series, xlabel, ylabel, title, marks, ylim)
+    return curves_of(ALONE, series, xlabel, ylabel, title, marks, ylim, xlim)
 
 
 def curves_of(
@@ -89,6 +91,7 @@ def curves_of(
     title: str = "",
     marks: Mapping[str, float] | None = None,
     ylim: tuple[float, float] | None = None,
+    xlim: tuple[float, float] | None = None,
 ) -> Figure:
     """Draw curves into a new figure.
 
@@ -100,6 +103,7 @@ def curves_of(
         title: Title.
         marks: Places of vertical lines, by their names.
         ylim: Limits of the vertical axis.
+        xlim: Limits of the horizontal axis.
 
     Returns:
         The figure.
@@ -118,6 +122,8 @@ def curves_of(
     axes.set(xlabel=xlabel, ylabel=textwrap.fill(ylabel, round(7 * width)), title=wrapped_title(title, width))
     if ylim is not None:
         axes.set_ylim(*ylim)
+    if xlim is not None:
+        axes.set_xlim(*xlim)
     legend_below(figure, axes)
     return figure
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,6 +13,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchsar.core import Axis, Signal
+from torchsar.metrics import impulse_response
+from torchsar.metrics.cuts import impulse_cuts
 from torchsar.plot.curves import curves_of
 from torchsar.plot.style import (
     ALONE,
@@ -197,7 +200,8 @@ def _show(signal: Signal, width: float, dynamic_range_db: float, title: str, top
     )
     axes.grid(False)
     # the colour scale has the height of the image
-    figure.colorbar(shown, ax=axes, label=label, fraction=0.05, pad=0.02, aspect=20 * max(1.0, ratio or 1.0))
+    words = textwrap.fill(label, max(15, round(12 * (height - 0.3))))
+    figure.colorbar(shown, ax=axes, label=words, fraction=0.05, pad=0.02, aspect=20 * max(1.0, ratio or 1.0))
     return figure
 
 
@@ -253,10 +257,44 @@ def images(
     """
     width = panel_width(len(signals))
     top = level(signals[reference or next(iter(signals))], percentile, width)
-    figures = {title: _show(signal, width, dynamic_range_db, title, top, "dB") for title, signal in signals.items()}
+    label = _below(percentile)
+    figures = {title: _show(signal, width, dynamic_range_db, title, top, label) for title, signal in signals.items()}
     for title, over in (lines or {}).items():
         _draw_over(figures[title], over, None)
     return list(figures.values())
+
+
+@styled
+def response(signal: Signal, at_m: tuple[float, float], floor_db: float = -50.0) -> list[Figure]:
+    """Draw both cuts of the point response nearest to a position, in dB relative to its peak.
+
+    The cuts have 16 points per sample. A line marks the -3 dB width, and the title has the PSLR,
+    both as by `metrics.impulse_response`.
+
+    Args:
+        signal: Image with two axes; the first trial is drawn.
+        at_m: Coordinates on the two axes in metres.
+        floor_db: Lowest level shown in dB.
+
+    Returns:
+        The figures, one for each axis.
+
+    Raises:
+        ValueError: If the position lies outside the image, or a sample is not finite.
+    """
+    one, figures = _first(signal), []
+    measured, cuts = impulse_response(one, at_m), impulse_cuts(one, at_m)
+    for axis in one.axes:
+        half = float(measured[f"irw_{axis.name}_m"]) / 2
+        mark = np.array([-half, half]), np.full(2, -3.0)
+        series = {
+            "cut": (array(cuts[axis.name][0]), decibel(cuts[axis.name][1], float(measured["peak"].abs()))),
+            f"-3 dB width {2 * half:.3g} {axis.unit}": mark,
+        }
+        title = f"{axis.name}: PSLR {float(measured[f'pslr_{axis.name}_db']):.1f} dB"
+        xlabel = f"{axis.name} from the peak ({axis.unit})"
+        figures.append(curves_of(PANEL, series, xlabel, "level (dB)", title, ylim=(floor_db, 1.0)))
+    return figures
 
 
 @styled

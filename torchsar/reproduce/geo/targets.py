@@ -23,6 +23,7 @@ from torchsar import plot
 from torchsar.core import Axis, Draws, Signal, take
 from torchsar.echo import simulate_bistatic
 from torchsar.metrics import azimuth_response, replica_level, replica_zones
+from torchsar.metrics.cuts import finer
 from torchsar.multichannel import (
     CorrectMigration,
     FocusAzimuth,
@@ -38,7 +39,6 @@ from torchsar.reproduce.geo.sensor import BANDWIDTH_HZ, INTEGRATION_S, TRANSMIT_
 from torchsar.reproduce.geo.sensor import RADAR as SENSOR
 from torchsar.reproduce.item import Check, Fact, Item, Made, number, statement
 from torchsar.scene import BandLimited, BistaticWorld, MovingPoints
-from torchsar.study.trials.cuts import finer
 
 # radar with a varying range to the satellite, which is contained in the echo
 RADAR = replace(SENSOR, transmit_range=TRANSMIT_RANGE)

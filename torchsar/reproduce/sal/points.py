@@ -24,11 +24,11 @@ from torchsar.core import Axis, Chain, Draws, Signal, Stage, Trace, Truth, use
 from torchsar.echo import simulate_ladar, simulate_ladar_record
 from torchsar.focus import AzimuthMatchedFilter, CompressSweeps, DerampAzimuth
 from torchsar.metrics import impulse_response
+from torchsar.metrics.cuts import impulse_cuts
 from torchsar.radar import LIGHT_M_S, TriangularLadar
 from torchsar.reproduce.item import Check, Item, number, parameters, statement
 from torchsar.scene import LadarWorld, Points, Polynomial, QuadraticInSweep, Sinusoid
 from torchsar.study.systems.sal.judge import Course, course_of, finer_in_range
-from torchsar.study.trials.cuts import impulse_cuts
 
 # values of Table 1; the sampling is chosen
 RADAR = TriangularLadar(

@@ -13,11 +13,11 @@ from torch import Tensor
 
 from torchsar import plot
 from torchsar.core import Signal
+from torchsar.metrics.cuts import about_peak, finer
 from torchsar.study.output.report import Drawn
 from torchsar.study.settings.sections import key_of
 from torchsar.study.systems.geo.judge import PeakCuts
 from torchsar.study.trials.batch import Result
-from torchsar.study.trials.cuts import about_peak, finer
 
 # lowest drawn levels of profiles and of spectra
 _LOW_DB, _SPECTRUM_DB = -90.0, -70.0

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from torchsar import plot
 from torchsar.core import Axis, Signal
+from torchsar.metrics.cuts import impulse_cuts
 from torchsar.study.output.report import Drawn, first_named
 from torchsar.study.systems.sal.judge import Course, finer_in_range
 from torchsar.study.trials.batch import Result, image_of
-from torchsar.study.trials.cuts import impulse_cuts
 
 # dynamic range of images and profiles, in which images out of focus are visible beside sharp ones
 _RANGE_DB = 40.0

@@ -14,12 +14,12 @@ from torch import Tensor
 from torchsar import plot
 from torchsar.compensate.velocity import EffectiveVelocity
 from torchsar.core import Signal
+from torchsar.metrics.cuts import impulse_cuts
 from torchsar.repair.response import band_grid
 from torchsar.study.names.registry import group_of
 from torchsar.study.output.report import Drawn
 from torchsar.study.systems.stripmap.image import focus_name, window
 from torchsar.study.trials.batch import IMAGE, Result, image_of
-from torchsar.study.trials.cuts import impulse_cuts
 
 
 def azimuth_spectrum(signal: Signal, bins: int = 256) -> tuple[Tensor, Tensor]:
