@@ -57,3 +57,12 @@ def test_the_label_of_the_colours_fits_a_flat_image() -> None:
 def test_curves_have_limits_of_both_axes() -> None:
     axes = plot.curves({"a": (np.arange(9.0), np.arange(9.0))}, "x", "y", ylim=(1, 2), xlim=(3, 4)).axes[0]
     assert axes.get_xlim() == (3, 4) and axes.get_ylim() == (1, 2)
+
+
+def test_a_profile_is_no_picture_and_what_draws_it_is_named() -> None:
+    profile = SIGNAL.isel(azimuth=0)
+    with pytest.raises(ValueError, match=r"a Signal with two axes, got \('range',\); .*plot.curves"):
+        plot.image(profile)
+    with pytest.raises(ValueError, match="a Signal with two axes"):
+        plot.image(Signal(torch.rand(2, 32), profile.axes))
+    plot.curves({"profile": (profile.axes[0].values(), abs(profile))}, "range (m)", "amplitude")

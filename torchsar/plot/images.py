@@ -64,7 +64,15 @@ def quicklook(signal: Signal, largest: int = 900) -> Signal:
     Returns:
         Root mean square amplitude of each block, on axes of the block centres; NaN for a block
         with a sample that is not finite. Samples at the end that do not fill a block are dropped.
+
+    Raises:
+        ValueError: If the signal does not have two axes.
     """
+    if len(signal.axes) != 2:
+        raise ValueError(
+            f"a picture needs a Signal with two axes, got {signal.names}; `signal.isel(AXIS=0)` removes an axis, and "
+            '`plot.curves({"profile": (axis.values(), abs(signal))}, "x", "y")` draws a profile'
+        )
     data, axes = signal.data.detach().abs(), []
     data = torch.where(torch.isfinite(data), data, torch.nan)
     peak = torch.nan_to_num(data).amax()
@@ -401,4 +409,4 @@ def _draw_over(
 
 def _first(signal: Signal) -> Signal:
     """First trial of a signal."""
-    return signal.with_data(signal.data.flatten(0, -3)[0]) if signal.trials else signal
+    return signal.with_data(signal.data.flatten(0, len(signal.trials) - 1)[0]) if signal.trials else signal
