@@ -464,7 +464,7 @@ class Scene:
         """Error of the expansion, and the properties that the window must have, from a sample of
         zones and pulses.
 
-        In a dense sample each sub-aperture, if there are not too many, occurs in one of the zones.
+        In a dense sample each sub-aperture occurs in one zone: those of a rough path differ.
         """
         device, step = self.grid.origin_m.device, self.grid.step_m
         (x, of_x), (y, of_y) = (
@@ -514,7 +514,7 @@ class Scene:
             of_tile = (of_row[:, None] * of_column).flatten().to(device)
             bounds = part_bounds(first, last, parts)
             if dense:
-                chosen = some_of(0, len(bounds), 32)[turn :: len(some)]
+                chosen = torch.arange(turn, len(bounds), len(some))
                 of_part = torch.ones(len(chosen))
             else:
                 chosen, of_part = _gauss_numbers(0, len(bounds))
