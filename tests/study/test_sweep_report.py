@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from tests.study.scenes import draw_first_panels
 from torchsar.core import Draws, Outcome
@@ -396,3 +397,21 @@ def test_a_record_of_a_script_draws_itself_and_has_a_table(tmp_path: Path) -> No
     assert lines[0].startswith("metric,algorithm,snr_db,n,trials,rmse") and len(lines) == 5
     with pytest.raises(FileExistsError):
         record.to_csv(tmp_path / "table.csv")
+    assert "95% interval" in [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def test_a_record_is_drawn_over_a_parameter_and_counts_outcomes() -> None:
+    def trial(parameters: Any, draws: Draws) -> Any:
+        error = draws.normal("noise", (1,))[:, 0] * parameters["scale"] * 10 ** (-parameters["snr_db"] / 20)
+        code = torch.where(error > 0, int(Outcome.OK), int(Outcome.NOISE))
+        return {"a": {"error_m": error, "outcome": code.to(torch.uint8)}}
+
+    grid = {"scale": [1.0, 2.0, 3.0], "snr_db": [0.0, 20.0]}
+    record = sweep(trial, grid, batched=["snr_db"], trials=20)
+    assert record.plot("error_m")[0].axes[0].get_xlabel() == "scale"
+    over = record.plot("error_m", over="snr_db")
+    assert len(over) == 3 and over[0].axes[0].get_xlabel() == "SNR (dB)"
+    with pytest.raises(KeyError, match="parameters of this record are .'scale', 'snr_db'., got 'snr'"):
+        record.plot("error_m", over="snr")
+    for row in record.table():
+        assert row["outcome_ok"] + row["outcome_noise"] == 20 and row["outcome_ok"] == row["ok_share"] * 20

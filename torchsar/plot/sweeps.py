@@ -17,6 +17,7 @@ from matplotlib.ticker import FuncFormatter, LogFormatterSciNotation, LogLocator
 from torchsar.plot.style import (
     COLOURS,
     DASHES,
+    FAINT,
     INK,
     MARKERS,
     legend_below,
@@ -35,6 +36,7 @@ def error_curves(
     log_x: bool = False,
     log_y: bool = False,
     ylim: tuple[float, float] | None = None,
+    band: str = "",
 ) -> list[Figure]:
     """Draw the errors of algorithms, with their confidence intervals, over one parameter.
 
@@ -52,6 +54,7 @@ def error_curves(
         log_x: Whether the horizontal axes are logarithmic.
         log_y: Whether the vertical axes are logarithmic.
         ylim: Limits of the vertical axes.
+        band: Name of the intervals in the legends; they are not named by default.
 
     Returns:
         The figures, one for each part that has values.
@@ -70,6 +73,8 @@ def error_curves(
     ends = [figure.axes[0].get_ylim() for figure in figures]
     common = ylim or (min((low for low, _ in ends), default=0.0), max((high for _, high in ends), default=1.0))
     for figure in figures:
+        if band:
+            figure.axes[0].fill_between([], [], color=FAINT, alpha=0.4, linewidth=0, label=band)
         _scale_axes(figure.axes[0], np.asarray(filled[0]["x"]), log_x, log_y, common)
         legend_below(figure, figure.axes[0])
     return figures

@@ -188,33 +188,43 @@ class Record(show.Shown):
             {name: list(values) for name, values in coordinates.items()},
         )
 
-    def plot(self, metric: str) -> Any:
+    def plot(self, metric: str, over: str = "") -> Any:
         """Draw a metric over the parameters, with its intervals and bounds, as reports do.
 
         Args:
             metric: Name of the metric. Of an error its RMSE is drawn, otherwise its median.
+            over: Name of the parameter on the horizontal axis; by default the first one with
+                several numbers.
 
         Returns:
-            Figures over the first parameter with several numbers, one for each value of the other
-            parameters; a notebook shows them, and `torchsar.plot.save` writes them.
+            Figures over this parameter, one for each value of the other parameters; a notebook
+            shows them, and `torchsar.plot.save` writes them.
 
         Raises:
-            KeyError: If the record has no such metric, or no finite number of it.
+            KeyError: If the record has no such metric or parameter, or no finite number of the
+                metric.
         """
         from torchsar.study.montecarlo.report import SweepPictures, main_quantity
 
         finite = [name for name, values in self.metrics.items() if np.isfinite(values).any()]
         if metric not in finite:
             raise KeyError(f"the metrics with finite numbers of this record are {finite}, got {metric!r}")
+        if over and over not in self.labels:
+            raise KeyError(f"the parameters of this record are {list(self.labels)}, got {over!r}")
         pictures = SweepPictures(summary_of(self, {}))
-        return next(pictures.curves(main_quantity(metric, bool(self.bounds.get(metric)))))[-1]
+        return next(pictures.curves(main_quantity(metric, bool(self.bounds.get(metric))), over))[-1]
 
     def table(self) -> list[dict[str, Any]]:
-        """Return the statistics of each metric, algorithm and point: rows of values by column."""
+        """Return the statistics of each metric, algorithm and point: rows of values by column.
+
+        Columns such as `outcome_ok` count the trials of each outcome that the record has.
+        """
         points = summary_of(self, {}).tree({"title": "", **self.about}, {})["points"]
         columns = ("n", "trials", "rmse", "median", "mean", "std", "ok_share")
+        codes = sorted({name for p in points for name in p["outcomes"]}, key=lambda name: Outcome[name])
         return [
             {"metric": p["metric"], "algorithm": p["algorithm"], **p["parameters"], **{c: p[c] for c in columns}}
+            | {f"outcome_{name.lower()}": p["outcomes"].get(name, 0) for name in codes}
             for p in points
         ]
 

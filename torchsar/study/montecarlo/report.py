@@ -242,8 +242,8 @@ class SweepPictures:
         if self.figures:
             yield from self.curves(share(next(iter(self.figures)), "ok", "share of trusted trials"))
 
-    def curves(self, quantity: Quantity) -> Drawn:
-        """Yield curves over each parameter with at least two numeric values.
+    def curves(self, quantity: Quantity, axis: str = "") -> Drawn:
+        """Yield curves over each parameter with at least two numeric values, or over a given one.
 
         Without such a parameter, the curves are over the non-numeric parameter with the most
         values, and if no parameter has several values, over the algorithms.
@@ -252,14 +252,14 @@ class SweepPictures:
             return
         longest = max(self.worded, key=lambda name: len(self.labels[name]), default="")
         ylim = (-0.04, 1.04) if quantity.is_share else None
-        for over in self.numeric or [longest]:
+        for over in [axis] if axis else self.numeric or [longest]:
             panels, note = self.panels_beside({over})
             name = quantity.field if quantity.field == "ok_share" else f"{quantity.metric}_{quantity.field}"
             along = over and f" over {name_and_unit(over)[0]}"
             for page, some in _paged(panels, PANELS):
                 parts = [self.part(quantity, panel, over) for panel in some]
                 x, logs = over and axis_label(over), (self.is_log(over), self.has_positive(quantity))
-                figure = plot.error_curves(parts, x, quantity.label, *logs, ylim)
+                figure = plot.error_curves(parts, x, quantity.label, *logs, ylim, band=f"{LEVEL:.0%} interval")
                 end = over and f"_over_{over.rpartition('.')[2]}"
                 yield name + end, quantity.title + along + page, self.caption(quantity) + note, figure
 
