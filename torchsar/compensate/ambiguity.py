@@ -295,8 +295,9 @@ class DopplerCentroid(Stage):
             "coherence" (of adjacent lines, 0..1). The outcome is EMPTY or NOISE where the phases of
             the lines are random, and AMBIGUOUS where the probability is 0.9 or less. It is MISFIT
             where the apertures that the ends of the record cut shift the centroid by an eighth of
-            the band of the beam or more. It is INEXACT from a standard deviation of 1.5 % of the
-            PRF on.
+            the band of the beam or more, and PARTS_DISAGREE where range cells ask for another
+            centroid, as beside a ship that moves. It is INEXACT from a standard deviation of 1.5 %
+            of the PRF on.
         """
         radar, raw = self.radar, checked_samples(signal.data, "DopplerCentroid", "pulse, range")
         n, prf = raw.shape[-1], radar.prf_hz

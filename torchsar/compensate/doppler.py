@@ -117,9 +117,12 @@ def phase_increment(
         The assessment adds info["cut_hz"], the shift by apertures that the ends of the record cut,
         which the value still contains, shape (...,); a standard deviation, of the scatter of the
         range blocks and of this shift; and the coherence of adjacent lines as `quality`. The
-        outcome is EMPTY or NOISE (adjacent lines are not coherent) where nothing was found, MISFIT
-        where targets are cut too strongly, and INEXACT from a standard deviation of 1.5 % of the
-        PRF on.
+        outcome is EMPTY or NOISE (adjacent lines are not coherent) where nothing was found, AT_REST
+        where a constant or a tone holds the energy, MISFIT where targets are cut too strongly,
+        PARTS_DISAGREE where range cells ask for another centroid, and INEXACT from a standard
+        deviation of 1.5 % of the PRF on. A target that moves on its own among few others is not
+        named if it changes the centroid by less than half of the band of the beam, or if its side
+        lobes hide them (rates on the page of outcomes).
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.

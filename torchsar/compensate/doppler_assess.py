@@ -1,10 +1,10 @@
 """Assessment of a Doppler centroid: its standard deviation, quality and outcome.
 
-Four questions are asked of the lines. Does a constant or a tone hold the energy? Are adjacent lines
+Five questions are asked of the lines. Does a constant or a tone hold the energy? Are adjacent lines
 coherent, so that there is anything but noise? Are the dwells of the targets complete, or do the
 ends of the record cut so many that the centroid is that of the cut ones? How far do the range
-blocks scatter? Of an absolute centroid it is also asked whether another multiple of the PRF
-explains the data as well.
+blocks scatter? Does a block of range cells ask for a centroid that no target of the beam shows? Of
+an absolute centroid it is also asked whether another multiple of the PRF explains the data as well.
 """
 
 from __future__ import annotations
@@ -43,6 +43,7 @@ class Increments(NamedTuple):
             where no tone stands out.
         coherent: True where the products of adjacent lines, or the changes of these products, add
             up to more than in noise, shape (...,).
+        noise: Coherence of adjacent lines of noise that all range cells share.
         scale: Frequency of a phase increment of 1 rad, in Hz.
 
     A target whose aperture is cut by an end of the record shows only a part of its band. Consider
@@ -59,6 +60,7 @@ class Increments(NamedTuple):
     ends: Tensor
     tone: Tensor
     coherent: Tensor
+    noise: float
     scale: float
 
     @staticmethod
@@ -102,7 +104,25 @@ class Increments(NamedTuple):
         spur = strongest_tone(x, rounds=1)
         energy = torch.where(spur.excess > 20, spur.share.double(), 0) * power.sum((-2, -1))
         tone = torch.polar(energy, 2 * math.pi * spur.pulse_cycles)
-        return Increments(products, power, half_band, ends, tone, coherent, prf_hz / (2 * math.pi))
+        noise = max(1, pairs) ** -0.5
+        return Increments(products, power, half_band, ends, tone, coherent, noise, prf_hz / (2 * math.pi))
+
+
+def several_motions(lines: Increments, phase_rad: Tensor) -> Tensor:
+    """True where a block of range cells asks for another centroid, because targets move on their
+    own, shape (...,).
+
+    Of the targets that share the motion, one whose aperture is cut shows up to half of the band
+    beside the centroid.
+
+    Args:
+        lines: Products of adjacent lines.
+        phase_rad: Phase increment of the centroid, shape (...,).
+    """
+    blocks = (lines.products * cis(-phase_rad)[..., None, None]).sum(-2)
+    # noise exceeds this coherence once in ten million blocks, also if range cells share it
+    seen = blocks.abs() > 4 * lines.noise * lines.power.sum(-2)
+    return (seen & (blocks.angle().abs() > lines.half_band_rad[..., None])).any(-1)
 
 
 def _adds_up(products: Tensor) -> Tensor:
@@ -161,6 +181,7 @@ def baseband(found: Estimate, lines: Increments) -> Estimate:
         quality=(lines.products.sum((-2, -1)).abs() / or_one(power)).clamp(0, 1),
         outcome=worst(
             (Outcome.INEXACT, scatter >= 2 * math.pi * MOST_STD),
+            (Outcome.PARTS_DISAGREE, several_motions(lines, phase)),
             (Outcome.MISFIT, short | (shift.abs() >= lines.half_band_rad / 4)),
             (Outcome.AT_REST, (away > math.pi * MOST_STD) | (lines.tone.abs() > 0.2 * power)),
             (Outcome.NOISE, ~lines.coherent),
@@ -195,6 +216,7 @@ def absolute(
     inexact = torch.minimum(refined_std_hz, scatter) >= unit * MOST_STD
     outcome = worst(
         (Outcome.INEXACT, ~lines.coherent | inexact),
+        (Outcome.PARTS_DISAGREE, several_motions(lines, found["doppler_hz"] / lines.scale)),
         (Outcome.MISFIT, shift >= lines.scale * lines.half_band_rad / 4),
         (Outcome.AMBIGUOUS, probability <= LEAST_PROBABILITY),
         # lines are incoherent, and the deviation is at least a third of that of random frequencies,

@@ -91,9 +91,10 @@ def segmented_interference(
         positive.
         `assess=True` adds the standard deviation and the outcome, see `assessed_velocity`:
         `Outcome.INEXACT` where the SNR is too low or the standard deviation exceeds
-        0.035 lambda / T (T is the length of a sweep), `AMBIGUOUS` where both sweeps have more power
-        in common at another velocity, `NOISE` where they have no more in common than noise, and
-        `EMPTY` for samples of zero. `quality` is the share of the power in the window that both
+        0.035 lambda / T (T is the length of a sweep), `PARTS_DISAGREE` where a part of the echo has
+        another velocity, `AMBIGUOUS` where both sweeps have more power in common at another
+        velocity, `NOISE` where they have no more in common than noise, and `EMPTY` for samples of
+        zero. `quality` is the share of the power in the window that both
         sweeps have in common. `info` holds "snr_db" (after compression) and "noise_m_s"
         (standard deviation that noise explains), shape (...,); "shift" (Doppler shift in whole
         bins) and "lit" (True in periods with an echo), shape (..., pulse); and
