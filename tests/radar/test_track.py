@@ -55,6 +55,19 @@ def test_decimal_commas(tmp_path: Path) -> None:
     assert read_track(tmp_path / "log.csv").position_m[:, 0].tolist() == [1.5, -1.25]
 
 
+def test_times_of_a_day(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("time,x,y,z\n10:15:30.05,1,2,3\n10:16:00,1,2,3\n")
+    assert read_track(tmp_path / "log.csv").time_s.tolist() == [36930.05, 36960.0]
+
+
+def test_a_missing_origin_of_latitudes_is_named(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("time,lat,lon,alt\n0,48,11,500\n1,48.001,11,500\n")
+    with pytest.warns(
+        UserWarning, match="no origin is given, and the scene is taken to lie at height 0 under the first"
+    ):
+        assert abs(float(read_track(tmp_path / "log.csv").position_m[0, 2]) - 500) < 1e-6
+
+
 def test_latitudes_become_local_and_records_with_nan_are_named(tmp_path: Path) -> None:
     latitude, longitude, height = 48 + 1e-4 * TIME, 11 + 0 * TIME, 500 + 0 * TIME
     height[[2, 5]] = np.nan
@@ -70,6 +83,11 @@ def test_latitudes_become_local_and_records_with_nan_are_named(tmp_path: Path) -
 MISTAKES = {
     "columns": ("time,x,y", [TIME, TIME, TIME], "must hold columns of one length with time and x, y, z"),
     "times": ("time,x,y,z", [TIME[::-1], *PLACE.T], "times rise, got 8, and 1.5 s after 1.75 s; sort them"),
+    "a record twice": (
+        "time,x,y,z",
+        [TIME[[0, 1, 1, 2]], *PLACE[[0, 1, 1, 2]].T],
+        "0.25 s after 0.25 s; remove the repeated record",
+    ),
     "scaled latitude": ("t,lat,lon,alt", [TIME, 48e7 + TIME, 11e7 + TIME, TIME], "whether they are scaled by 1e7"),
     "text": ("t,x,y,z\n1,2,3,4\n1,2,three,4", [TIME, *PLACE.T], "row 3 is no row of numbers: '1,2,three,4'"),
     "a name twice": ("t,x,y,x", [TIME, *PLACE.T], "several columns have the name 'x'; give each a name of its own"),

@@ -68,7 +68,7 @@ def read_track(file: str | Path, origin: Sequence[float] | None = None) -> Track
 
     The file is a table in text (commas, semicolons or blanks, with a line of names, which may begin
     with #), or a numpy archive (.npz) with one array per column. Its columns are:
-    - `time` in seconds, or dates such as 2024-05-17T10:15:30.5;
+    - `time` in seconds, dates such as 2024-05-17T10:15:30.5, or times of one day as 10:15:30.5;
     - `x`, `y`, `z` in metres, or `latitude` and `longitude` in degrees with `height` in metres.
     Common other names such as `t`, `east`, `lat`, `alt` are known, and units behind them, as in
     `time_ms` or `x (km)`. A table of four numbers without names has the columns time, x, y, z.
@@ -109,9 +109,10 @@ def read_track(file: str | Path, origin: Sequence[float] | None = None) -> Track
     steps = time_s.diff()
     if len(time_s) < 2 or not bool((steps > 0).all()):
         at = 0 if len(time_s) < 2 else int(steps.argmin()) + 1
+        advice = "remove the repeated record" if at and float(steps.min()) == 0 else "sort them"
         raise ValueError(
             f"{path} must hold two records or more whose times rise, got {len(time_s)}"
-            + (f", and {float(time_s[at]):.9g} s after {float(time_s[at - 1]):.9g} s; sort them" if at else "")
+            + (f", and {float(time_s[at]):.9g} s after {float(time_s[at - 1]):.9g} s; {advice}" if at else "")
         )
     if not earth:
         return Track(time_s, place if origin is None else place - place.new_tensor(list(origin)))
@@ -120,6 +121,12 @@ def read_track(file: str | Path, origin: Sequence[float] | None = None) -> Track
         raise ValueError(
             f"{path}: latitude is {low[0]:g} to {high[0]:g} and longitude {low[1]:g} to {high[1]:g}, and must be "
             "degrees of at most 90 and 360; check their order, and whether they are scaled by 1e7"
+        )
+    if origin is None:
+        warnings.warn(
+            f"{path}: no origin is given, and the scene is taken to lie at height 0 under the first record; give "
+            "origin=(latitude, longitude, height) of its middle",
+            stacklevel=2,
         )
     frame = LocalFrame(*(origin or (*place[0, :2].tolist(), 0.0)))
     return Track(time_s, frame.local_m(geocentric(*place.unbind(-1))), frame)
@@ -181,9 +188,11 @@ def _numbered(table: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _value(cell: str) -> float:
-    """Number in a cell; a date is converted to seconds, and an empty cell to NaN."""
+    """Number in a cell; a date or a time of day is converted to seconds, an empty cell to NaN."""
     if not cell:
         return float("nan")
+    if clock := re.fullmatch(r"(\d\d?):(\d\d):(\d\d(?:\.\d*)?)", cell):
+        return 3600 * int(clock[1]) + 60 * int(clock[2]) + float(clock[3])
     try:
         return float(cell)
     except ValueError:
