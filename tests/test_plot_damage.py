@@ -55,6 +55,27 @@ def test_texts_that_are_no_formulas_are_shown_as_they_are_written(text: str) -> 
     plot.save(plot.curves(series, text, text, title=text), io.BytesIO())
 
 
+@pytest.mark.parametrize("low", [1e-12, 8e-5, 0.3, 2e4])
+@pytest.mark.parametrize("ratio", [1.02, 3.0, 80.0, 1e5])
+def test_logarithmic_axes_show_plain_numbers(low: float, ratio: float) -> None:
+    x, y = low * np.geomspace(1.0, ratio, 12), low * np.geomspace(1.0, ratio, 12)
+    part = {"title": "", "x": x, "series": {"a": (y, np.stack([y, y], -1))}, "bounds": {}}
+    words = {**part, "x": ["a", "b"], "series": {"a": (y[[0, -1]], np.stack([y[[0, -1]]] * 2, -1))}}
+    map_ = {"title": "", "x": [1, 2, 3], "y": [1, 2, 3, 4], "z": y.reshape(4, 3)}
+    figures = [
+        *plot.error_curves([part], "x", "y", log_x=True, log_y=True),
+        *plot.error_curves([words], "", "y", log_y=True),
+        *plot.heat_map([map_], "x", "y", "z", log=True),
+        plot.trade(["a", "b"], [x[0], x[-1]], [1.0, 0.5], "loss (dB)", "t"),
+    ]
+    for figure in figures:
+        plot.save(figure, io.BytesIO())
+        for axis in (axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)):
+            texts = [text.get_text() for text in axis.get_ticklabels(which="both")]
+            assert not any("$" in text for text in texts), texts
+            assert axis.get_scale() == "linear" or ratio < 2 or sum(map(bool, texts)) > 1, texts
+
+
 def test_a_picture_that_fails_costs_no_other(tmp_path: Path) -> None:
     def drawn(name: str) -> Iterator:
         yield name, name, "A caption.", plot.curves({"a": (np.arange(3.0), torch.arange(3.0))}, "x", "y")

@@ -15,13 +15,13 @@ import zarr
 from tests.study.scenes import IMAGE, ISAL, SCENES, bench_of, draw_first_panels, loaded_as, run, write
 from torchsar.cli import main
 from torchsar.compensate.pulse_phase import Sca
-from torchsar.core import Axis, Draws, Signal, numpy_random
+from torchsar.core import Axis, Draws, Outcome, Signal, numpy_random
 from torchsar.study.commands.sweep import SweepTrial
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.settings.sections import cases_of
 from torchsar.study.table import load, systems
 from torchsar.study.trials import bench as benches
-from torchsar.study.trials.batch import Batch, summary
+from torchsar.study.trials.batch import Batch, summary, verdict
 from torchsar.study.trials.bench import Bench
 
 EVERY = pytest.mark.parametrize("system", SCENES)
@@ -318,6 +318,12 @@ def test_methods_cannot_take_the_names_of_groups_of_results(system: str, tmp_pat
 
 
 BAD_NAMES = ["", " ", ".", "..", "zarr.json", "a/b", "__a", "a\nb", "x" * 61, "é" * 31, "\ud800"]
+
+
+def test_the_share_of_trials_that_are_ok_is_that_of_assessed_estimates() -> None:
+    silent, best = torch.ones(3).long(), torch.tensor([Outcome.OK, Outcome.NOISE, Outcome.NOT_ASSESSED])
+    found = verdict({"autofocus": best, "correct": silent})
+    assert found["outcome"].tolist() == best.tolist() and summary(found) == {"ok": 0.5}
 
 
 @pytest.mark.parametrize("name", BAD_NAMES, ids=range(len(BAD_NAMES)))

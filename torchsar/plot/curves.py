@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from torch import Tensor
 
 from torchsar.plot.style import (
@@ -248,9 +247,6 @@ def trade(
     # margin in decades, at least 0.3, so that ticks at 1, 2 and 5 appear
     margin = max(0.12 * (high - low), 0.3)
     low, high = low - margin, high + margin
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high - low < 3 else (1,)))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
     axes.step(
         [s for s, _ in front] + [10**high], [e for _, e in front] + [front[-1][1]], where="post", color=INK, zorder=0
     )

@@ -15,11 +15,13 @@ import torch
 from cycler import cycler
 from matplotlib import rc_context
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imsave
 from matplotlib.mathtext import MathTextParser
 from matplotlib.text import Text
+from matplotlib.ticker import LogFormatter, LogLocator
 from torch import Tensor
 
 # palette, by choice: colours of text and frames, and colours of curves in their order
@@ -89,7 +91,7 @@ def styled(draw: Callable[..., Drawn]) -> Callable[..., Drawn]:
     """Run a drawing function in the style of this package, without a change of global settings.
 
     Texts that are no formulas of matplotlib, such as commands of LaTeX that it lacks, are shown as
-    they are written.
+    they are written. Logarithmic axes without labels of their own show plain numbers.
 
     Args:
         draw: Function that returns a figure or a list of figures.
@@ -105,9 +107,19 @@ def styled(draw: Callable[..., Drawn]) -> Callable[..., Drawn]:
         for figure in drawn if isinstance(drawn, list) else [drawn]:
             for text in figure.findobj(Text):
                 text.set_parse_math("$" in text.get_text() and _is_formula(text.get_text()))
+            _number_ticks(*(axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)))
         return Panels(drawn) if isinstance(drawn, list) else drawn
 
     return styled
+
+
+def _number_ticks(*axes: Axis) -> None:
+    """Write plain numbers at logarithmic axes, also between powers of 10 at short ones."""
+    for axis in (axis for axis in axes if isinstance(axis.get_major_formatter(), LogFormatter)):
+        low, high = axis.get_view_interval()
+        if high < 1000 * low:
+            axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high > 10 * low else (1, 1.5, 2, 3, 4, 5, 6, 8)))
+        axis.set(major_formatter=lambda value, _: f"{value:g}", minor_formatter="")
 
 
 def _is_formula(text: str) -> bool:

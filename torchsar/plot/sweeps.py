@@ -12,7 +12,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogFormatterSciNotation, LogLocator, NullFormatter
 
 from torchsar.plot.style import (
     COLOURS,
@@ -75,7 +74,7 @@ def error_curves(
     for figure in figures:
         if band:
             figure.axes[0].fill_between([], [], color=FAINT, alpha=0.4, linewidth=0, label=band)
-        _scale_axes(figure.axes[0], np.asarray(filled[0]["x"]), log_x, log_y, common)
+        _scale_axes(figure.axes[0], np.asarray(filled[0]["x"]), log_x, common)
         legend_below(figure, figure.axes[0])
     return figures
 
@@ -169,24 +168,15 @@ def _label_words(axes: Axes, words: Sequence[str]) -> None:
     axes.set_xticks(np.arange(len(words)), words, rotation=40, ha="right")
 
 
-def _scale_axes(axes: Axes, x: np.ndarray, log_x: bool, log_y: bool, ylim: tuple[float, float]) -> None:
-    """Set the scales, the ticks and the limits of the axes."""
+def _scale_axes(axes: Axes, x: np.ndarray, log_x: bool, ylim: tuple[float, float]) -> None:
+    """Set the horizontal scale and its ticks, and the limits of the vertical axis."""
     if x.dtype.kind != "U":
         axes.set_xscale("log" if log_x else "linear")
         position = np.log(x) if log_x else x
         if len(x) <= 8 and np.diff(position).min(initial=np.inf) > 0.08 * np.ptp(position):
             axes.set_xticks(x, [f"{value:g}" for value in x])
-            axes.xaxis.set_minor_formatter(NullFormatter())
+            axes.xaxis.set_minor_formatter("")
     axes.set_ylim(*ylim)
-    if log_y and ylim[1] < 1000 * ylim[0]:
-        subs = (1, 2, 5) if ylim[1] > 10 * ylim[0] else (1, 1.5, 2, 3, 4, 5, 6, 8)
-        axes.yaxis.set_major_locator(LogLocator(subs=subs))
-        axes.yaxis.set_major_formatter(
-            FuncFormatter(lambda value, _: f"{value:g}")
-            if ylim[0] >= 1e-3 and ylim[1] < 1e5
-            else LogFormatterSciNotation(minor_thresholds=(math.inf, math.inf))
-        )
-        axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 @styled

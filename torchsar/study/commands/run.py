@@ -171,7 +171,7 @@ def metrics_tree(loaded: Loaded, results: Mapping[str, Result]) -> dict[str, Any
         "parameter",
         "in_doubt": "methods.NAME.in_doubt: stages that use neutral values also where an estimate is doubtful "
         "(in_doubt: neutral)",
-        "ok": "whether all estimates of the method are reliable; its mean is over the trials that were assessed",
+        "ok": "whether all assessed estimates of the method are reliable; its mean is over the trials that have some",
         "seconds": "wall time of the chain of the method per trial; shared estimates count in every method",
         "targets_outside": "named targets outside the image, or never in the beam; a case has their number",
     }

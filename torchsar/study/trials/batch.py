@@ -185,11 +185,17 @@ def summary(metrics: Metrics) -> dict[str, float]:
 
 
 def verdict(codes: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return {"ok": whether all estimates of a trial are reliable, bool (trial,), "outcome": the
-    worst code}, or {} without estimates.
+    """Return {"ok": whether all assessed estimates of a trial are reliable, bool (trial,),
+    "outcome": the worst code of them}, or {} without estimates.
+
+    A trial has the outcome NOT_ASSESSED only if none of its estimates was assessed.
     """
-    worst = torch.stack(list(codes.values())).amax(0) if codes else None
-    return {} if worst is None else {OK: worst < Outcome.INEXACT, OUTCOME: worst}
+    if not codes:
+        return {}
+    every = torch.stack(list(codes.values()))
+    silent = every == Outcome.NOT_ASSESSED
+    worst = every.masked_fill(silent & ~silent.all(0), int(Outcome.OK)).amax(0)
+    return {OK: worst < Outcome.INEXACT, OUTCOME: worst}
 
 
 def rows(x: Tensor, count: int) -> Tensor:
