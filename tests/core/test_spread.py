@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -93,6 +94,59 @@ def test_an_unknown_error_is_infinite_and_a_failed_estimate_has_none() -> None:
     assert spread.metrics["entropy"].tolist() == [math.inf, 0.0]
 
 
+class Scale(Stage):
+    """Multiplies by a positive gain, and refuses others as stages do with a velocity."""
+
+    works_on = ("azimuth", "range")
+
+    def forward(self, signal: Signal, gain: Tensor) -> Signal:
+        if not bool((gain > 0).all()):
+            raise ValueError("gain must be positive in every trial")
+        return signal.with_data(signal.data * gain[:, None, None])
+
+
+@pytest.mark.parametrize("code", [Outcome.INEXACT, Outcome.MISFIT, Outcome.NOISE])
+def test_a_trial_with_a_doubtful_estimate_is_infinite_and_leaves_the_others_unchanged(code: Outcome) -> None:
+    data = Draws(1).normal("data", (3, PULSES, CELLS), torch.complex128)
+    signal = Signal(data, (Axis("azimuth", PULSES, 0.0, 0.1, "m"), Axis("range", CELLS, 0.0, 0.15, "m")))
+
+    def estimate(std: float, outcome: Outcome) -> Estimate:
+        codes = torch.tensor([Outcome.OK, outcome, Outcome.OK])
+        return Estimate({"gain": torch.full((3,), 2.0)}, {"gain": torch.tensor([0.1, std, 0.2])}, outcome=codes)
+
+    def spread(estimate: Estimate, in_doubt: str = "apply") -> tuple[Tensor, Tensor]:
+        made = Chain(
+            found=Given(estimate),
+            scaled=use(Scale(), gain="found.gain", in_doubt=in_doubt),
+            sum=metrics.Measure(lambda signal: signal.data.abs().sum((-2, -1))),
+        )
+        found = made.spread(made.trace(signal))
+        return found.pixels, found.metrics["sum"]
+
+    plain, bad = spread(estimate(0.1, Outcome.OK)), spread(estimate(1e6, code))
+    held = replace(estimate(1e6, code), neutral={"gain": 1.0})
+    neutral = spread(held, "neutral")
+    for good, one, kept in zip(plain, bad, neutral, strict=True):
+        assert torch.equal(one[::2], good[::2]) and torch.equal(kept[::2], good[::2])
+        # without a neutral value that of a failed estimate is used too
+        assert bool(one[1].isinf().all()) and bool((kept[1] == 0).all())
+    used = bool(spread(held)[0][1].isinf().all())
+    assert used == code.is_doubtful
+
+
+class Given(Stage):
+    """Returns the same estimate for each signal."""
+
+    works_on, provides = ("azimuth", "range"), ("gain",)
+
+    def __init__(self, estimate: Estimate) -> None:
+        super().__init__()
+        self.estimate = estimate
+
+    def forward(self, signal: Signal) -> Estimate:
+        return self.estimate
+
+
 class Aligned(Stage):
     """Estimates a gain and applies it at once."""
 
@@ -112,6 +166,11 @@ def test_what_cannot_be_carried_is_one_sentence() -> None:
     assert torch.allclose(again.pixels, 2 * alone.spread(plain).pixels)
     with pytest.raises(ValueError, match=r"names the estimates \['nothing'\], the trace has \['align', 'phase'\]"):
         made.spread(trace, of=["nothing"])
+    for pairs in (0, -1, 2.5):
+        with pytest.raises(ValueError, match=f"`pairs` must be a whole number of at least 1, got {pairs}"):
+            made.spread(trace, of=["phase"], pairs=pairs)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match=r"got the text 'phase'; write \['phase'\]"):
+        made.spread(trace, of="phase")
     bare, without = traced(Estimate(dict(phases().value), quality=torch.ones(2)))
     with pytest.raises(ValueError, match="no stage uses a value with a standard deviation"):
         bare.spread(without)
@@ -120,14 +179,14 @@ def test_what_cannot_be_carried_is_one_sentence() -> None:
 
 
 def share_within(trace: Trace, true: Trace, made: Chain, name: str = "") -> float:
-    """Share of trials (and pixels) whose change by the errors is within one standard deviation."""
+    """Share of reliable trials (and pixels) whose change by the errors is within one deviation."""
     spread = made.spread(trace)
     found, wanted, std = (
         (trace.metrics[name], true.metrics[name], spread.metrics[name])
         if name
         else (trace.signal.data.abs(), true.signal.data.abs(), spread.pixels)
     )
-    return float(((found - wanted).abs() <= std).double().mean())
+    return float(((found - wanted).abs() <= std)[std.isfinite()].double().mean())
 
 
 def levels(trials: int, snr_db: float) -> dict[str, Tensor]:

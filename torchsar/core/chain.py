@@ -243,17 +243,24 @@ class Chain(Shown, nn.Module):
         is the root mean square of the changes. A value has the signs + and - in these pairs, and n
         values take n pairs, rounded up to a power of two, with which the result is exact for small
         errors. If these are more than `pairs`, as for a phase per pulse, so many are chosen at
-        random, always the same ones, and the result is uncertain by a share of at most
-        `1 / (2 * pairs) ** 0.5`.
+        random, always the same ones, and the result has a standard error, which is no bound: a
+        share of at most `1 / (2 * pairs) ** 0.5`.
 
         A metric which the estimate itself makes best, such as the entropy after autofocus, has no
         first derivative there; the result is then the size of its change by the curvature.
 
         Errors of different estimates, and within an estimate without factors those of different
-        values, count as independent. Values without a standard deviation count as exact, and so do
-        the samples: the noise that reaches the image directly is not part of the result. It is
-        infinite in trials in which a standard deviation is, and zero where the estimate failed,
-        because its neutral value is used.
+        values, count as independent, and all as free of bias. Values without a standard deviation
+        count as exact, and so do the samples: the noise that reaches the image directly is not part
+        of the result. The standard deviation of pixels is often mostly that of a common shift of
+        the image. Changes below the rounding of the samples, about 1e-7 of the image in complex64,
+        are not resolved.
+
+        A standard deviation describes the error of a reliable estimate. The result is infinite in
+        trials in which a stage uses a doubtful estimate, such as an `INEXACT` one, a failed one
+        without a neutral value, or one of infinite standard deviation. It is zero where the neutral
+        value is used, because the estimate failed or by `in_doubt="neutral"`. The values of these
+        trials are not moved, and the results of the other trials do not depend on them.
 
         >>> import torch
         >>> from torchsar import Axis, Chain, Estimate, Signal, compensate, metrics, use
@@ -280,7 +287,8 @@ class Chain(Shown, nn.Module):
 
         Raises:
             ValueError: If no later stage uses a value with a standard deviation, or a stage that
-                both estimates and corrects has one, since it cannot be repeated with another value.
+                both estimates and corrects has one, since it cannot be repeated with another value;
+                or if `of` is a text, or `pairs` is less than 1.
         """
         return spread_of(self, trace, of, pairs)
 

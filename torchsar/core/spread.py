@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core.draws import Draws
-from torchsar.core.estimate import Estimate
+from torchsar.core.estimate import Estimate, Outcome
 from torchsar.core.show import Shown, Summary, content
 
 if TYPE_CHECKING:
@@ -51,11 +51,13 @@ class _Error:
         estimate: The estimate.
         key: Name of the value.
         trials: Trial dimensions of the estimate.
+        in_doubt: "apply" if a stage uses the value also where it is doubtful, else "neutral".
     """
 
     estimate: Estimate
     key: str
     trials: torch.Size
+    in_doubt: str
 
     @property
     def signs(self) -> tuple[int, ...]:
@@ -68,21 +70,31 @@ class _Error:
         return tuple(shape[n:] if factor is None else (*self.estimate.outcome.shape[n:], factor.shape[-1]))
 
     def with_signs(self, signs: Tensor) -> Tensor:
-        """Error with these signs, in the shape of the value; zero where its size is not finite."""
+        """Error with these signs, in the shape of the value; zero where its size is not known."""
         std, factor = self.estimate.std[self.key], self.estimate.factor.get(self.key)
         if factor is None:
             error = std * signs.to(std)
         else:
             between = (None,) * (std.ndim - self.estimate.outcome.ndim)
             error = (factor * signs.to(factor)[(..., *between, slice(None))]).sum(-1)
-        return torch.where(error.isfinite(), error, 0)
+        return torch.where(self._known & error.isfinite(), error, 0)
 
     @property
     def unknown(self) -> Tensor:
-        """True in trials in which the value is used and its standard deviation is not finite."""
-        std, failed = self.estimate.std[self.key], self.estimate.failed
-        lost = ~std.isfinite() & ~failed[(..., *(None,) * (std.ndim - failed.ndim))]
-        return lost.reshape(*self.trials, -1).any(-1)
+        """True in trials in which the value is used and the size of its error is not known."""
+        neutral = self.key in self.estimate.neutral
+        # without a neutral value only an empty place of a list of targets has no use
+        unused = self.estimate.unused(self.in_doubt) if neutral else self.estimate.outcome == Outcome.ABSENT
+        return (~self._known & ~self._wide(unused)).reshape(*self.trials, -1).any(-1)
+
+    @property
+    def _known(self) -> Tensor:
+        """True where the standard deviation describes the error, in the shape of the value."""
+        return self.estimate.std[self.key].isfinite() & self._wide(self.estimate.ok)
+
+    def _wide(self, mask: Tensor) -> Tensor:
+        """Mask of the shape of the outcome with the dimensions of the value."""
+        return mask[(..., *(None,) * (self.estimate.std[self.key].ndim - mask.ndim))]
 
 
 def spread_of(chain: Chain, trace: Trace, of: Collection[str] | None, pairs: int) -> Spread:
@@ -97,6 +109,8 @@ def spread_of(chain: Chain, trace: Trace, of: Collection[str] | None, pairs: int
     Returns:
         Standard deviations of pixels and metrics.
     """
+    if not isinstance(pairs, int) or pairs < 1:
+        raise ValueError(f"`pairs` must be a whole number of at least 1, got {pairs!r}; 32 is the default")
     errors, start = _errors(chain, trace, of)
     # values with factors share the signs of their estimate
     slots = {(name, "" if key in x.estimate.factor else key): x.signs for (name, key), x in errors.items()}
@@ -129,6 +143,8 @@ def spread_of(chain: Chain, trace: Trace, of: Collection[str] | None, pairs: int
 def _errors(chain: Chain, trace: Trace, of: Collection[str] | None) -> tuple[dict[tuple[str, str], _Error], str]:
     """Errors of values that stages use, by estimate and value, and the first of these stages."""
     sources = {name: {source.partition(".")[::2] for source in names.values()} for name, names in chain.uses.items()}
+    if isinstance(of, str):
+        raise ValueError(f"`of` must be a collection of names of estimates, got the text {of!r}; write [{of!r}]")
     wanted = set(trace.estimates) if of is None else set(of)
     if not wanted <= set(trace.estimates):
         raise ValueError(f"`of` names the estimates {sorted(wanted)}, the trace has {sorted(trace.estimates)}")
@@ -138,8 +154,14 @@ def _errors(chain: Chain, trace: Trace, of: Collection[str] | None) -> tuple[dic
                 f"stage {name!r} both estimates and corrects, and cannot be repeated with another value; estimate and "
                 "correct in two stages, or leave it out: `of` names the estimates whose errors count"
             )
+    applied = {pair for name, pairs in sources.items() if chain.in_doubt[name] == "apply" for pair in pairs}
     errors = {
-        (name, key): _Error(trace.estimates[name], key, trace.outputs[name].trials)
+        (name, key): _Error(
+            trace.estimates[name],
+            key,
+            trace.outputs[name].trials,
+            "apply" if (name, key) in applied else "neutral",
+        )
         for name, key in dict.fromkeys(pair for pairs in sources.values() for pair in sorted(pairs))
         if name in wanted and key in trace.estimates[name].std
     }
