@@ -106,3 +106,8 @@ def test_a_stage_of_a_function_holds_connects_and_saves_its_parameters() -> None
         made(gain=2.0)
     with pytest.raises(ValueError, match=r"works on the axes \('azimuth',\)"):
         Stage.of(scale, works_on=("azimuth",))()(signal, factor=three)
+
+
+def test_a_measure_without_its_image_says_how_it_is_called() -> None:
+    with pytest.raises(ValueError, match=r"'im'; connect it .*the signal itself is a first parameter called image or "):
+        Chain(peak=metrics.Measure(lambda im: im.data.abs().amax()))

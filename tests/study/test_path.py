@@ -10,14 +10,17 @@ import pytest
 import torch
 
 from tests.study.scenes import PATH, TILES, bench_of, loaded_as, run, world
-from torchsar.core import Draws
+from torchsar.core import Draws, Estimate
 from torchsar.radar import LIGHT_M_S
 from torchsar.study.commands.requires import refuse_beyond_limits
+from torchsar.study.commands.run import _entry
 from torchsar.study.commands.sweep import SweepTrial
 from torchsar.study.montecarlo import sweep
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.settings.sections import cases_of
+from torchsar.study.systems.path.figures import paths
 from torchsar.study.table import load
+from torchsar.study.trials.batch import Judged, Processed, Result
 from torchsar.study.trials.bench import Bench
 
 pytestmark = pytest.mark.usefixtures("blank_pictures")
@@ -162,6 +165,25 @@ def test_a_pulse_rate_below_the_band_of_the_beam_is_named(tmp_path: Path) -> Non
         bench = bench_of(tmp_path, "path", world=world("path", beam={"width_deg": width}))
         (limit,) = (one for one in bench.system.limits(bench) if "distance of pulses" in one.name)
         assert limit.verdict == verdict and limit.limit == pytest.approx(100 / 111.8 / width, rel=0.02)
+
+
+def test_what_a_strip_does_not_see_adds_nothing_to_the_deviation_of_a_path(tmp_path: Path) -> None:
+    bench, seen = bench_of(tmp_path, "path"), torch.arange(40) >= 20
+    std = torch.where(seen, 1e-4, 5e-3).double()[None]
+    estimate = Estimate({"line_of_sight_m": std}, std={"line_of_sight_m": std})
+    judged = Judged({}, view=torch.zeros(1, 40).double().masked_fill(~seen, math.nan))
+    found = bench.system.found(bench, Processed(judged, {"autofocus": estimate}), bench.trials(bench.draws(0, [0])))
+    entry = _entry(found["autofocus.line_of_sight_m"])
+    assert entry["value"] == pytest.approx(1e-4) and entry["std"] == pytest.approx(1e-4)
+
+
+@pytest.mark.parametrize("metres", [0.0, 1e-3])
+def test_paths_without_errors_have_no_panel(tmp_path: Path, metres: float) -> None:
+    sway = {"sway": {"kind": "sinusoid", "amplitude_m": metres, "frequency_hz": 3.0}}
+    own = {"nominal": PATH["world"]["transmitter"]["nominal"]}
+    bench = bench_of(tmp_path, "path", world=world("path", navigation={"x": sway}, transmitter=own))
+    drawn = list(paths(Result(bench, bench.batch(Draws(3, "run", range(1)), methods=["none"]), {}, {}, {}, {}, {})))
+    assert [len(figures) for *_, figures in drawn] == ([1] if metres else [])
 
 
 def test_a_motion_log_is_flown(tmp_path: Path) -> None:

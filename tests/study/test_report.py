@@ -6,6 +6,7 @@ import json
 import math
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from torchsar.metrics.cuts import about_peak, finer, impulse_cuts
 from torchsar.metrics.image import rolled_to
 from torchsar.metrics.impulse import impulse_response
 from torchsar.study.output.numbers import number, quantity, scale_of
-from torchsar.study.output.report import draw_all, run_fields
+from torchsar.study.output.report import comparisons, draw_all, run_fields
 from torchsar.study.trials.system import Column
 
 # --- numbers
@@ -137,6 +138,13 @@ def test_empty_panels_are_left_out_and_the_others_share_a_scale() -> None:
     assert plot.error_curves(parts[1:2], "x", "y") == []
     cells = [{"title": str(i), "x": [1, 2], "y": [1], "z": z} for i, z in enumerate((nothing[None], level[None]))]
     assert [figure.axes[0].get_title() for figure in plot.heat_map(cells, "x", "y", "z")] == ["1"]
+
+
+def test_a_metric_that_is_zero_everywhere_has_no_picture() -> None:
+    metrics = {name: {"lost_m": torch.zeros(2), "left_m": torch.full((2,), 1e-3)} for name in ("ideal", "a", "b")}
+    columns = {key: Column(key, "m", drawn="rms") for key in ("lost_m", "left_m")}
+    drawn = comparisons(dict.fromkeys(("1 mm", "1 cm"), SimpleNamespace(metrics=metrics)), columns)
+    assert [name for name, *_ in drawn] == ["left_m"]
 
 
 def test_curves_of_like_size_share_a_panel() -> None:

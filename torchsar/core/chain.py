@@ -127,6 +127,7 @@ class Chain(Shown, nn.Module):
                     raise ValueError(
                         f"stage {name!r} ({type(stage).__name__}) needs the value {p.name!r}; connect it "
                         f"(`use`) with {choices}, or with 'aux.NAME' for recorded side data"
+                        f"{getattr(stage, 'connects_hint', '')}"
                     )
             available |= {f"{name}.{key}" for key in _provided(stage)}
 
@@ -451,7 +452,7 @@ def _connectable(stage: nn.Module) -> list[inspect.Parameter]:
     """Parameters of a stage that `use` can connect.
 
     These are the parameters of `forward` after the signal, or `connects` of a stage that calls a
-    function.
+    function; its `connects_hint` ends the message that one of them lacks a connection.
     """
     found = getattr(stage, "connects", None)
     return list(inspect.signature(stage.forward).parameters.values())[1:] if found is None else list(found)

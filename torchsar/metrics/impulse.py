@@ -67,11 +67,11 @@ def impulse_response(
     Returns:
         For each axis A of the image `irw_A_m` (-3 dB width), `pslr_A_db` (strongest side lobe
         within `sidelobe_nulls`), `islr_A_db` (energy of the side lobes divided by that of the main
-        lobe, null to null) and `position_A_m`; and `peak`, the complex interpolated peak. The
-        shapes are those of `at_m` broadcast with the trials. Where a side lobe exceeds the peak,
-        there is no point response, and widths and side lobes are NaN; a warning says so. A weak
-        target in the same row or column as a stronger one is measured with so few `sidelobe_nulls`
-        that these do not reach the stronger one.
+        lobe, null to null) and `position_A_m`; and `peak`, the interpolated peak, which is complex:
+        `float` takes its `abs()`. The shapes are those of `at_m` broadcast with the trials. Where a
+        side lobe exceeds the peak, there is no point response, and widths and side lobes are NaN; a
+        warning says so. A weak target in the same row or column as a stronger one is measured with
+        so few `sidelobe_nulls` that these do not reach the stronger one.
 
     Raises:
         ValueError: If the signal does not have two axes, is not finite, or a position lies outside

@@ -46,6 +46,7 @@ class Measure(nn.Module):
         self.function = partial(function, **constants)
         parameters = list(inspect.signature(function).parameters.values())
         self.of_signal = bool(parameters) and parameters[0].name in ("image", "signal")
+        self.connects_hint = "" if self.of_signal else "; the signal itself is a first parameter called image or signal"
         self.connects = [p for p in parameters[self.of_signal :] if p.name not in constants]
 
     def extra_repr(self) -> str:

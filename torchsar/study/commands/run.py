@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -162,7 +163,7 @@ def metrics_tree(loaded: Loaded, results: Mapping[str, Result]) -> dict[str, Any
         "metrics": "methods.NAME.metrics are means over trials of the first case, "
         f"{next(iter(results))!r}; methods.NAME.cases has all cases, with standard deviations over trials as _sd",
         "estimates": f"an estimate of more than {_LISTED} numbers per trial is given by its mean and its rms standard "
-        "deviation; arrays.zarr has all numbers",
+        "deviation, of a path over the pulses that see the imaged strip; arrays.zarr has all numbers",
         "outcomes": "methods.NAME.outcomes: by stage that estimates, the number of trials of each outcome, with its "
         "sentence: what was seen, and what to try; of several targets the worst one counts",
         "neutral": "methods.NAME.neutral: number of trials in which an estimate was not used, because it failed, by "
@@ -236,8 +237,9 @@ def _entry(found: Found) -> dict[str, Any]:
     """
     value, std, codes = found.value, found.std, found.outcome
     if value[0].numel() > _LISTED:
-        value = value.double().flatten(1).mean(1)
-        std = None if std is None else std.double().flatten(1).square().mean(1).sqrt()
+        known = torch.ones_like(value).bool() if std is None or not std.isfinite().any() else std.isfinite()
+        value = value.where(known, math.nan).double().flatten(1).nanmean(1)
+        std = None if std is None else std.double().flatten(1).square().nanmean(1).sqrt()
     outcomes = None if codes is None else list(map(Outcome, codes.tolist()))
     return {
         "value": _listed(value),

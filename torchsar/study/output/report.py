@@ -251,6 +251,8 @@ def _drawn(make: Callable[[], Drawn]) -> Drawn:
 def comparisons(results: Mapping[str, Any], columns: Mapping[str, Any], without: str = "ideal") -> Drawn:
     """Yield a picture of each metric over the cases, or over the methods if there is one case.
 
+    A metric that is zero everywhere has no picture.
+
     Args:
         results: Results by case, with `metrics` by method and name.
         columns: Presentation of the metrics; those with `drawn` are drawn.
@@ -274,7 +276,9 @@ def comparisons(results: Mapping[str, Any], columns: Mapping[str, Any], without:
             x, series = names, {"": np.array([table[name][0] for name in names])}
         drawn = {name: (y, np.stack([y, y], -1)) for name, y in series.items()}
         known = np.concatenate([y[np.isfinite(y)] for y in series.values()])
-        log = len(known) > 0 and known.min() > 0 and (column.drawn == "rms" or known.max() > _DECADES * known.min())
+        if not known.any():
+            continue
+        log = known.min() > 0 and (column.drawn == "rms" or known.max() > _DECADES * known.min())
         label = f"{column.label} ({column.unit})" if column.unit else column.label
         statistic = "Root mean square" if column.drawn == "rms" else "Mean"
         figures = plot.error_curves([{"title": "", "x": x, "series": drawn, "bounds": {}}], "", label, log_y=log)

@@ -56,7 +56,7 @@ from torchsar.study.names.registry import (
 from torchsar.study.systems.isal import estimated_phase, received
 from torchsar.study.systems.path.figures import geometry, images, paths
 from torchsar.study.systems.path.requirements import flight_requirements
-from torchsar.study.trials.batch import IMAGE, Batch, Judged, Metrics, Processed, Trials
+from torchsar.study.trials.batch import IMAGE, Batch, Found, Judged, Metrics, Processed, Trials
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Alternative, Choice, Measured, lit_noise, some_pixels, white_noise
 from torchsar.study.trials.system import Column, Noise, System, World, by_limit
@@ -353,6 +353,20 @@ class AnyPath(System):
                 metrics |= positions
         metrics = {key: value.double().expand(trials.count) for key, value in metrics.items()}
         return Judged(metrics, targets if detail else {}, outside if detail else (), view=left)
+
+    def found(self, bench: Bench, outcome: Processed, trials: Trials) -> dict[str, Found]:
+        """Return the estimates, without standard deviations (NaN) outside of the imaged strip.
+
+        Pulses that do not see the strip change no image, and their line of sight is extrapolated.
+        """
+        table = super().found(bench, outcome, trials)
+        left = outcome.judged.view
+        return {
+            key: one
+            if left is None or one.std is None or one.std.shape != left.shape
+            else replace(one, std=one.std.where(left.isfinite(), math.nan))
+            for key, one in table.items()
+        }
 
     def compare(self, bench: Bench, outcome: Processed, ideal: Processed | None) -> Judged:
         judged = super().compare(bench, outcome, ideal)

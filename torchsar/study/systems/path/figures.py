@@ -21,8 +21,11 @@ def images(result: Result) -> Drawn:
     yield "images", "Images by every method", caption, plot.images(shown, 45.0)
 
 
-def paths(result: Result) -> Drawn:
-    """Draw the deviations of the true path from a straight line, and its remaining errors."""
+def paths(result: Result, rounding: float = 1e-9) -> Drawn:
+    """Draw the deviations of the true path from a straight line, and its remaining errors.
+
+    A panel whose values differ from zero by rounding only is left out.
+    """
     trials = result.first.trials
     if not trials.truth:  # no errors were added to the recording
         return
@@ -47,7 +50,10 @@ def paths(result: Result) -> Drawn:
             "title": title,
         }
         for (title, label), of in shown.items()
+        if any(np.nanmax(np.abs(y), initial=0.0) > rounding for y in of.values())
     ]
+    if not parts:
+        return
     caption = (
         "The first trial. The error of the line of sight is that of half the path over the middle of the scene, "
         "recorded and corrected minus true, without constant and linear terms, which hardly change the focus."
