@@ -12,6 +12,7 @@ from torchsar.core import Recording
 from torchsar.metrics import error_db
 from torchsar.radar import LIGHT_M_S, AntennaPath
 from torchsar.study.settings.sections import cases_of
+from torchsar.study.systems.path.requirements import flight_requirements
 from torchsar.study.table import load
 from torchsar.study.trials.bench import Bench
 
@@ -97,6 +98,24 @@ def test_requirements_predict_the_displacement():
     bench = Bench(next(iter(cases_of(load("fmcw_squint", ["world.pulses=300"])).values())))
     (row,) = (row for row in bench.system.requirements(bench) if row.effect == "an antenna at rest during a sweep")
     assert row.range_cells == pytest.approx(2.33, rel=0.05) and not row.ok and row.remedy == "correct_sweep_motion"
+
+
+@pytest.mark.parametrize("beam", [None, scene.SideBeam(width_deg=4.0)])
+def test_requirements_hold_for_the_largest_rate_of_a_pass_at_broadside(beam):
+    """The mean of the range rate is zero: nothing is displaced, but the ends of a pass are blurred.
+
+    At the last of 256 pulses, 25.5 m along the track and 600 m away, the rate is 1.698 m/s; half of
+    a beam of 4 degrees has 40 sin(2 deg) = 1.396 m/s.
+    """
+    slow = radar.InverseRadar(10e9, 100e6, 200.0, pulse_s=5e-3)
+    place = torch.zeros(256, 3).double()
+    place[:, 0], place[:, 1] = -600.0, 40.0 * (torch.arange(256) - 127.5) / 200.0
+    path = AntennaPath(place, None, 2 * place.norm(dim=-1))
+    rows = {row.effect: row for row in flight_requirements(slow, path, path, beam)}
+    row = rows["an antenna at rest during a sweep"]
+    rate_m_s = 1.698 if beam is None else 1.396
+    assert row.phase_rad == pytest.approx(4 * math.pi * 10e9 / LIGHT_M_S * rate_m_s * 2.5e-3, rel=5e-3)
+    assert not row.ok and row.range_cells == pytest.approx(0.0, abs=1e-9)
 
 
 def test_a_radar_without_a_length_of_sweeps_is_refused():

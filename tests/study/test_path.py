@@ -213,4 +213,18 @@ def test_what_a_flight_requires(tmp_path: Path) -> None:
     distance = 1500 * np.sqrt(2)
     assert rows["the recorded speed"].phase_rad == pytest.approx(turn * 100 * 2 * 0.48**2 / distance, rel=0.05)
     assert "an error of 2 m/s" in rows["the recorded speed"].neglects and rows["the recorded path"].ok
+    # a sixteenth of the wavelength of 31.2 mm
+    assert "0.00195 m along the line of sight leave a phase of pi / 4" in rows["the recorded path"].neglects
     assert rows["an antenna at rest during an echo"].ok
+
+
+def test_an_origin_with_its_latitude_and_longitude_exchanged_is_named(tmp_path: Path) -> None:
+    rows = (f"{t / 50:.2f},{48 + 1e-5 * t},11.0,520" for t in range(80))
+    (tmp_path / "log.csv").write_text("\n".join(["time_s,lat,lon,alt_m", *rows]))
+    nominal = {"kind": "recorded_path", "file": str(tmp_path / "log.csv"), "origin": [11.0, 48.0, 300.0]}
+    flight = {**PATH["world"]["transmitter"], "nominal": nominal}
+    changed = world("path", transmitter=flight, beam={"width_deg": 6.0})
+    images = {"recommended": {"stages": {"image": {**TILES, "beam_deg": 6.0}}}}
+    bench = bench_of(tmp_path, "path", world=changed, processor=images, metrics={})
+    with pytest.raises(ConfigError, match=r"passes it at 5.\d*e\+06 m; check the origin of a motion log"):
+        refuse_beyond_limits(bench, "")

@@ -173,8 +173,19 @@ class PathImage(Stage):
         ends = torch.tensor([[0, antennas.pulses]]).expand(len(points), 2) if lit is None else lit(points)
         seen = ends[:, 1] > ends[:, 0]
         if not bool(seen.any()):
-            empty, remedy = "the image is empty", "check width and squint of the beam, and the centre of the image"
-            return [Limit("the number of pulses that see the image", 0, 1, "", "refuse", empty, remedy, at_least=True)]
+            near_m = float((antennas.places[-1][..., None, :] - points).norm(dim=-1).min())
+            return [
+                Limit(
+                    "the number of pulses that see the image",
+                    0,
+                    1,
+                    "",
+                    "refuse",
+                    f"the image is empty; the path passes it at {near_m:.4g} m",
+                    "check the origin of a motion log, width and squint of the beam, and the centre of the image",
+                    at_least=True,
+                )
+            ]
         low, high = spatial_band(points[seen], grid.axes, antennas, frequency_hz, ends[seen])
         held = _HELD if self.windows == ("hann", "hann") else 1.0
         steps = (1 / (held * (high.amax(0) - low.amin(0)))).tolist()

@@ -28,9 +28,10 @@ def flight_requirements(
 
     Returns:
         Rows for a straight path, for the recorded one, for its speed, for an antenna at rest while
-        an echo is on its way, and, where the length of a sweep is known, during a sweep: the range
-        rate, of the middle of the beam or the mean of the record, times the carrier frequency over
-        the chirp rate displaces the image.
+        an echo is on its way, and, where the length of a sweep is known, during a sweep: its phase
+        is that of the largest range rate within the beam or the record, at the ends of a sweep. The
+        range rate of the middle of the beam, or the mean of the record, times the carrier frequency
+        over the chirp rate displaces the image.
     """
     held = [path.of_trial((0,) * len(path.trials)) for path in (true, recorded)]
     place, known = (path.places[-1].detach().cpu() for path in held)
@@ -66,9 +67,10 @@ def flight_requirements(
     off = abs(float(torch.linalg.lstsq(basis, known - place).solution[1] @ heading))
     turn, quarter = 4 * math.pi / radar.wavelength_m, math.pi / 4
     remedy = "autofocus (path_autofocus, strip_autofocus), which finds errors that change slowly over the aperture"
+    allowed = f"{quarter / turn:.3g} m along the line of sight leave a phase of pi / 4"
     rows = (
         ("a straight path", f"deviations of {bent:.3g} m from a straight line", bent, "image along the recorded path"),
-        ("the recorded path", f"errors of navigation of {error:.3g} m", error, remedy),
+        ("the recorded path", f"errors of navigation of {error:.3g} m; {allowed}", error, remedy),
         ("an antenna at rest during an echo", f"motion while an echo is on its way, {moved:.3g} m", moved, "move it"),
     )
     found = [
@@ -78,11 +80,17 @@ def flight_requirements(
     if radar.pulse_s is not None:
         legs = torch.stack([v.detach().cpu().norm(dim=-1) for v in held[0].places]).mean(0)
         rate = float((legs[-1] - legs[0]) / (time[-1] - time[0]))
+        largest = float(torch.gradient(legs, spacing=(time,))[0].abs().max())
         if beam is not None:
-            rate = speed * math.sin(math.radians(float(torch.as_tensor(beam.squint_deg).mean())))
+            squint, half = torch.as_tensor(beam.squint_deg).deg2rad(), torch.as_tensor(beam.width_deg).deg2rad() / 2
+            rate = speed * math.sin(float(squint.mean()))
+            largest = speed * math.sin(min(float((squint.abs() + half).max()), math.pi / 2))
         off_m = abs(rate) * radar.carrier_hz / radar.chirp_rate_hz_s
-        what = f"motion within {radar.pulse_s:.3g} s, which displaces the image by {off_m:.3g} m in slant range"
-        ends = turn * abs(rate) * radar.pulse_s / 2
+        what = (
+            f"motion within {radar.pulse_s:.3g} s at a range rate of up to {largest:.3g} m/s, whose mean displaces the "
+            f"image by {off_m:.3g} m in slant range"
+        )
+        ends = turn * largest * radar.pulse_s / 2
         at_rest = ("an antenna at rest during a sweep", what, ends, off_m / radar.range_step_m, quarter)
         found.append(Requirement(*at_rest, "correct_sweep_motion"))
     neglects = f"an error of {off:.3g} m/s; {tolerated:.3g} m/s leave a phase of pi / 4 at the ends of {dwell_s:.3g} s"
