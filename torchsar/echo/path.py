@@ -120,7 +120,8 @@ def _moving_echo(
 
     The sample of the frequency f is taken when it is sent. Relative to the middle of the lit points
     its phase changes little within a sweep, so that it is interpolated between histories of
-    antennas at rest at Chebyshev points of the sweep, as many as the precision needs.
+    antennas at rest at Chebyshev points of the sweep, as many as the precision needs for constant
+    range rates within a sweep; vibrations need more, see `MotionInSweep`.
     """
     frequency = _frequencies_hz(radar, n, time_s.device)
     half_s = radar.bandwidth_hz / radar.chirp_rate_hz_s / 2

@@ -149,6 +149,11 @@ class MotionInSweep:
     The frequency rises by the bandwidth within `pulse_s`, and positions are those of its middle.
     Motion within a sweep displaces a point in range by its range rate times the carrier frequency
     over the chirp rate, and slightly blurs it; `compensate.CorrectSweepMotion` corrects both.
+
+    Motion that changes slowly within a sweep is simulated to rounding (-180 dB in complex128).
+    Vibrations with a large part of a cycle within a sweep are less exact: 1 mm along the line of
+    sight at 10 GHz, with sweeps of 2 ms, has errors of -183 dB at 20 Hz, -130 to -110 dB at 200 Hz
+    and -75 to -55 dB at 500 Hz (one cycle), by the extent of the scene.
     """
 
 

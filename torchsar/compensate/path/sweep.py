@@ -39,6 +39,11 @@ def correct_sweep_motion(
     that of the point, some pulses at the ends are less exact. The correction does not change the
     power of noise. Differentiable.
 
+    Range rates and their changes are differences between pulses, so that vibrations must be slow
+    against the PRF. Of a vibration of 1 mm along the line of sight at 10 GHz, with a PRF of 500 Hz
+    and sweeps of 2 ms, errors of about -79 dB are left at 20 Hz, -37 dB at 100 Hz, -29 dB at
+    200 Hz and -8 dB at 400 Hz.
+
     Args:
         profiles: Range profiles, the unitary centred inverse FFT of frequencies that are sent in
             rising order, shape (..., pulse, range), complex.
