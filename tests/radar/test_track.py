@@ -125,3 +125,36 @@ def test_a_flight_takes_a_path_only() -> None:
         TypeError, match=r"nominal must be an object with position_m\(time_s\), such as Str.*got 'log.csv'"
     ):
         scene.Flight("log.csv")  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "GPS Time (s),Latitude (deg),Longitude (deg),Ellipsoidal height (m)",
+        "utc_time,lat,lon,altitude_msl",
+        "time(seconds),latitude(degrees),longitude(degrees),height(meters)",
+    ],
+)
+def test_headers_of_instruments(tmp_path: Path, header: str) -> None:
+    (tmp_path / "log.csv").write_text(f"{header}\n0,48,11,500\n1,48.001,11,500\n")
+    track = read_track(tmp_path / "log.csv", origin=(48.0, 11.0, 450.0))
+    assert track.time_s.tolist() == [0.0, 1.0] and track.position_m[1].tolist() == pytest.approx(
+        [0, 111.2, 50], abs=0.1
+    )
+
+
+def test_milliseconds_in_a_word(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("time(millisecond),x,y,z\n0,1,2,3\n500,1,2,3\n")
+    assert read_track(tmp_path / "log.csv").time_s.tolist() == [0.0, 0.5]
+
+
+def test_degrees_without_names_are_no_metres(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("0,48.0,11.0,500\n1,48.001,11.0,500\n")
+    with pytest.raises(ValueError, match=r"no line of names, and columns 2 and 3 \(48, 11\) hardly change"):
+        read_track(tmp_path / "log.csv")
+
+
+def test_an_unknown_column_is_named_with_the_known_names(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("time,lat,lon,level\n0,48,11,500\n1,48.001,11,500\n")
+    with pytest.raises(ValueError, match=r"got .*level \(2\).*height may be called h, height, alt, altitude, ell"):
+        read_track(tmp_path / "log.csv")

@@ -17,18 +17,19 @@ from torchsar.radar.local_frame import LocalFrame, geocentric
 
 # accepted names of the columns, in lower case and without unit
 _NAMES = {
-    "time": "t time timestamp seconds sec gps_time gpstime gps_seconds tow utc",
+    "time": "t time timestamp seconds sec gps_time gpstime gps_seconds tow utc utc_time time_utc",
     "x": "x east easting e pos_x x_enu",
     "y": "y north northing n pos_y y_enu",
     "z": "z up u pos_z z_enu",
     "latitude": "lat latitude phi",
     "longitude": "lon long lng longitude lambda",
-    "height": "h height alt altitude ellipsoidal_height elevation hgt",
+    "height": "h height alt altitude ellipsoidal_height elevation hgt altitude_msl height_msl alt_msl",
 }
 # accepted units after a name, as in time_ms, x (km) or lat[deg], with their factors
 _UNITS = {
     **{"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "m": 1.0, "km": 1e3, "cm": 1e-2, "mm": 1e-3},
-    **{"ft": 0.3048, "deg": 1.0, "rad": 180 / np.pi},
+    **{"ft": 0.3048, "deg": 1.0, "degree": 1.0, "rad": 180 / np.pi},
+    **{"second": 1.0, "millisecond": 1e-3, "meter": 1.0, "metre": 1.0},
 }
 _COLUMN = re.compile(r"(?P<name>.*?)(?:[_ ]*[(\[](?P<unit>\w+)[)\]]|_(?P<suffix>[a-z]+))?")
 
@@ -71,26 +72,29 @@ def read_track(file: str | Path, origin: Sequence[float] | None = None) -> Track
     - `time` in seconds, dates such as 2024-05-17T10:15:30.5, or times of one day as 10:15:30.5;
     - `x`, `y`, `z` in metres, or `latitude` and `longitude` in degrees with `height` in metres.
     Common other names such as `t`, `east`, `lat`, `alt` are known, and units behind them, as in
-    `time_ms` or `x (km)`. A table of four numbers without names has the columns time, x, y, z.
-    Other columns are ignored. Records with NaN are left out, and a warning names them.
+    `time_ms`, `x (km)` or `time(milliseconds)`. A table of four numbers without names has the
+    columns time, x, y, z; it is refused where x and y might be degrees, and change by less than a
+    hundredth of z. Other columns are ignored. Records with NaN are left out, and a warning names
+    them.
 
     Args:
         file: Path of the log.
         origin: Origin of the coordinates: x, y, z in metres, or latitude and longitude in degrees
-            and height in metres. None for that of the file, or for the place of the first record at
-            height 0.
+            and height in metres, above the same level as in the log. None for that of the file, or
+            for the place of the first record at height 0.
 
     Returns:
         The track.
 
     Raises:
         FileNotFoundError: If there is no such file.
-        ValueError: If columns are missing, fewer than two records are left, times do not rise, or
-            latitudes and longitudes are none.
+        ValueError: If columns are missing, or without names and possibly degrees, fewer than two
+            records are left, times do not rise, or latitudes and longitudes are none.
     """
     path = Path(file)
     held = read_table(path)
-    columns = _known(dict(zip("txyz", held.values())) if [*held] == ["0", "1", "2", "3"] else held)
+    unnamed = [*held] == ["0", "1", "2", "3"]
+    columns = _known(dict(zip("txyz", held.values())) if unnamed else held)
     earth = "latitude" in columns
     wanted = ("time", *(("latitude", "longitude", "height") if earth else ("x", "y", "z")))
     missing = [name for name in wanted if name not in columns]
@@ -98,6 +102,7 @@ def read_track(file: str | Path, origin: Sequence[float] | None = None) -> Track
         raise ValueError(
             f"{path} must hold columns of one length with time and x, y, z, or time, latitude, longitude and height, "
             f"got {', '.join(f'{name} ({len(x)})' for name, x in columns.items())}; name the columns in its first line"
+            + "".join(f"; {name} may be called {', '.join(_NAMES[name].split())}" for name in missing)
         )
     table = np.stack([columns[name] for name in wanted], -1)
     bad = np.flatnonzero(~np.isfinite(table).all(-1))
@@ -115,6 +120,12 @@ def read_track(file: str | Path, origin: Sequence[float] | None = None) -> Track
             + (f", and {float(time_s[at]):.9g} s after {float(time_s[at - 1]):.9g} s; {advice}" if at else "")
         )
     if not earth:
+        size, reach = place.abs().amax(0).tolist(), (place.amax(0) - place.amin(0))[:2]
+        if unnamed and size[0] <= 90 and size[1] <= 360 and float(reach.max()) < 0.01 * size[2]:
+            raise ValueError(
+                f"{path} has no line of names, and columns 2 and 3 ({place[0, 0]:g}, {place[0, 1]:g}) hardly change, "
+                "as degrees do; write time,lat,lon,height or time,x,y,z into its first line"
+            )
         return Track(time_s, place if origin is None else place - place.new_tensor(list(origin)))
     if float(place[:, 0].abs().max()) > 90 or float(place[:, 1].abs().max()) > 360:
         low, high = place.amin(0).tolist(), place.amax(0).tolist()
@@ -208,10 +219,11 @@ def _known(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """
     found: dict[str, np.ndarray] = {}
     for name, values in columns.items():
-        text = name.strip().lower()
+        text = re.sub(r"\s+", "_", name.strip().lower())
         parts = _COLUMN.fullmatch(text)
         unit = parts and (parts["unit"] or parts["suffix"])
-        plain, factor = (parts["name"].strip(), _UNITS[unit]) if parts and unit in _UNITS else (text, 1.0)
+        unit = unit if unit in _UNITS else unit and unit.removesuffix("s")
+        plain, factor = (parts["name"].strip("_"), _UNITS[unit]) if parts and unit in _UNITS else (text, 1.0)
         known = next((key for key, names in _NAMES.items() if plain in names.split()), name)
         found.setdefault(known, values * factor if known != name or plain != text else values)
     return found
