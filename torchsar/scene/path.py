@@ -152,8 +152,8 @@ class MotionInSweep:
 
     Motion that changes slowly within a sweep is simulated to rounding (-180 dB in complex128).
     Vibrations with a large part of a cycle within a sweep are less exact: 1 mm along the line of
-    sight at 10 GHz, with sweeps of 2 ms, has errors of -183 dB at 20 Hz, -130 to -110 dB at 200 Hz
-    and -75 to -55 dB at 500 Hz (one cycle), by the extent of the scene.
+    sight at 10 GHz, with sweeps of 2 ms, has errors below -180 dB at 20 Hz, -130 to -90 dB at 200
+    Hz and -75 to -55 dB at 500 Hz (one cycle), by the extent of the scene.
     """
 
 
