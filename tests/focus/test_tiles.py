@@ -397,6 +397,19 @@ def test_a_path_about_the_scene_keeps_the_error(turns: float, raised_m: float, b
     assert moved.error_db(image) < -57
 
 
+@pytest.mark.parametrize(("step", "wanted"), [(0.1, -30.0), (0.3, -40.0)])
+def test_pulses_at_the_ends_of_a_wide_arc_stay_within_the_window(step: float, wanted: float) -> None:
+    """The carrier of a pulse with eps below 0 moves by more than eps."""
+    angle, radius, carrier = torch.linspace(0, 3.445, 200, dtype=F64), 1.1e4, 4.9e9
+    place = radius * torch.stack([torch.cos(angle), torch.sin(angle), torch.full_like(angle, 0.5)], -1)
+    step = step * C / carrier
+    grid = ImageGrid(torch.tensor([-24 * step, -24 * step, 0.0], dtype=F64), torch.eye(3)[:2], (48, 48), step)
+    frequency = carrier * (1 + 0.28 / 50 * (torch.arange(50, dtype=F64) - 25))
+    noise = torch.randn(200, 50, dtype=C128, generator=torch.Generator().manual_seed(3))
+    drawn = Case(frequency, place, None, 2 * torch.linalg.vector_norm(place, dim=-1), grid, noise)
+    assert drawn.error_db(drawn.plan(wanted).image(noise)) < wanted
+
+
 def pointed(place: Tensor, points: Tensor, width: float, looks: Tensor | float = 0.0) -> Tensor:
     """Gaussian pattern over the sine of the angle ahead of broadside, less that of each look."""
     away = points[:, None] - place

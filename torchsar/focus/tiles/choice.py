@@ -181,8 +181,9 @@ def _choose_slope(scene: Scene, sampled: Sampled, error: float) -> tuple[tuple[i
     Also returns the error that the window has. The result is None if no window is suitable.
     """
     found, cells, (low, carrier, high) = [], 24, scene.waves
-    # a tenth more than in the sampled pulses
-    most = 1.1 * float(sampled.stretch.abs().max())
+    # A stretched pulse moves the carrier to k / (1 + eps), see expansion.py; a tenth more than in
+    # the sampled pulses is admitted.
+    most = 1.1 * float((1 / (1 + sampled.stretch) - 1).abs().max())
     for oversampling in (1.25, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0):
         if found and oversampling * cells > min(found)[0]:
             break  # no slope is short enough
