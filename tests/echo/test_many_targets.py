@@ -79,3 +79,12 @@ def test_a_row_does_not_depend_on_other_trials():
     whole = LineSum(turns, 96, -48, torch.complex64)(weight.to(torch.complex64))
     alone = LineSum(turns[2], 96, -48, torch.complex64)(weight[2].to(torch.complex64))
     torch.testing.assert_close(whole[2], alone, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("turns", [1e18, 1e300, float("inf"), float("nan")])
+@pytest.mark.parametrize("by_transform", [True, False])
+def test_phases_that_float64_does_not_resolve_are_refused(turns, by_transform):
+    given = torch.full((2, 70), 0.25, dtype=torch.float64)
+    given[1, 3] = turns
+    with pytest.raises(ValueError, match="phase must be at most 4e"):
+        LineSum(given, 96, -48, torch.complex64, by_transform)

@@ -95,7 +95,7 @@ def reduced_turns(turns: Tensor) -> Tensor:
             f"the phase must be in float64 turns, got {turns.dtype}; compute it in float64, since a range of "
             "700 km is 1e7 turns at S band and 1e12 turns in the near infrared"
         )
-    _check_resolution(turns)
+    check_resolution(turns)
     return turns - torch.round(turns.detach())
 
 
@@ -142,8 +142,15 @@ def unit_phasor(turns: Tensor, dtype: torch.dtype) -> Tensor:
     return cis((2 * math.pi * reduced_turns(turns)).to(real_dtype(dtype)))
 
 
-def _check_resolution(turns: Tensor) -> None:
-    """Raise ValueError for phases beyond the precision of float64."""
+def check_resolution(turns: Tensor) -> None:
+    """Check that float64 resolves phases.
+
+    Args:
+        turns: Phases in turns, float64.
+
+    Raises:
+        ValueError: If the largest exceeds 4e11 turns, or one is not finite.
+    """
 
     def check(worst: float) -> None:
         if not worst <= MAX_TURNS:

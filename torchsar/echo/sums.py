@@ -10,8 +10,8 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from torchsar.core import linear_phasor, unit_phasor
 from torchsar.core.nufft import Nufft
+from torchsar.core.phase import check_resolution, linear_phasor, unit_phasor
 
 
 def blocks(n: int, bytes_each: float, cache_bytes: int = 8 << 20, most: int | None = None) -> Iterator[slice]:
@@ -80,8 +80,9 @@ def row_bytes(targets: int, n: int, dtype: torch.dtype) -> int:
     Returns:
         Size in bytes.
     """
-    by_transform = summed_by_transform(targets, n)
-    return dtype.itemsize * (25 * targets + 8 * n if by_transform else 4 * targets * (1 + math.isqrt(n)))
+    return dtype.itemsize * (
+        25 * targets + 8 * n if summed_by_transform(targets, n) else 4 * targets * (1 + math.isqrt(n))
+    )
 
 
 class LineSum:
@@ -98,6 +99,9 @@ class LineSum:
         dtype: Complex dtype of the sums.
         by_transform: Whether to use the non-uniform FFT; None for the rule of
             `summed_by_transform`.
+
+    Raises:
+        ValueError: If the phase of a step exceeds 4e11 turns, see `unit_phasor`.
     """
 
     def __init__(
@@ -108,6 +112,7 @@ class LineSum:
             summed_by_transform(turns.shape[-1], n, turns.device) if by_transform is None else by_transform
         )
         if self.by_transform:
+            check_resolution(max(-first, first + n) * turns)
             self.transform = Nufft(n, 1e-7 if dtype == torch.complex64 else 1e-13, dtype, turns.device)
             self.points = self.transform.points(turns)
             if first != -(n // 2):
