@@ -109,8 +109,8 @@ class Increments(NamedTuple):
 
 
 def several_motions(lines: Increments, phase_rad: Tensor) -> Tensor:
-    """True where a block of range cells asks for another centroid, because targets move on their
-    own, shape (...,).
+    """Find where a block of range cells asks for another centroid, because targets move on their
+    own.
 
     Of the targets that share the motion, one whose aperture is cut shows up to half of the band
     beside the centroid.
@@ -118,6 +118,9 @@ def several_motions(lines: Increments, phase_rad: Tensor) -> Tensor:
     Args:
         lines: Products of adjacent lines.
         phase_rad: Phase increment of the centroid, shape (...,).
+
+    Returns:
+        True where a block does, shape (...,).
     """
     blocks = (lines.products * cis(-phase_rad)[..., None, None]).sum(-2)
     # noise exceeds this coherence once in ten million blocks, also if range cells share it
