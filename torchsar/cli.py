@@ -376,18 +376,22 @@ def _bench(options: argparse.Namespace) -> int:
     import torch
 
     from torchsar.study.bench.entrant import MethodError
-    from torchsar.study.bench.records import methods_of, read, recorded, score, together
-    from torchsar.study.bench.show import save, table
+    from torchsar.study.bench.records import methods_of, read, recorded, same_scenes, score, together
+    from torchsar.study.bench.show import new_files, save, table
     from torchsar.study.memory import keep_freed_memory
     from torchsar.study.output.progress import told
 
     keep_freed_memory()
     if options.threads is not None:
         torch.set_num_threads(options.threads)
+    new_files(options.out)
     methods, files = methods_of(options.methods)
     records = [recorded(options.bench) if file == "recorded" else read(Path(file)) for file in files]
-    if methods or not files:
-        chosen = {"trials": options.trials, "small": options.small, "draw": options.draw}
+    chosen = {"trials": options.trials, "small": options.small, "draw": options.draw}
+    runs = bool(methods or not files)
+    this = {"this run": {"bench": options.bench, **chosen}} if runs else {}
+    same_scenes({**dict(zip(files, records, strict=True)), **this})
+    if runs:
         try:
             records.append(score(options.bench, methods or None, **chosen, say=told("worlds")))
         except MethodError as error:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -155,6 +156,47 @@ def always_ok(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return found["phase_rad"], found.std["phase_rad"], torch.ones(len(x), dtype=torch.bool)
 
 
+def of_frames(x: Tensor) -> Tensor:
+    """Whatever the frames above hold that has the shape of phases, the arguments of a test too."""
+
+    def phases(value: Any, depth: int) -> Iterator[Tensor]:
+        if isinstance(value, Tensor) and value.shape == x.shape[:-1] and value.is_floating_point():
+            yield value
+        parts = value if isinstance(value, list | tuple) else value.values() if isinstance(value, dict) else ()
+        for part in [*parts, *getattr(value, "__dict__", {}).values()] if depth else ():
+            yield from phases(part, depth - 1)
+
+    above, frame_above = [], sys._getframe(1)
+    while frame_above is not None:
+        above += [found for value in list(frame_above.f_locals.values()) for found in phases(value, 3)]
+        frame_above = frame_above.f_back
+    return above[0].clone() if above else torch.zeros(x.shape[:-1])
+
+
+def test_no_frame_above_a_method_holds_the_truth() -> None:
+    rows = few(of_frames)
+    assert rows["all"]["right"][0] == 0 and without_time(rows) == without_time(few(methods.uncorrected))
+
+
+def test_phases_far_below_the_bound_are_said_to_leak_and_are_not_ranked(tmp_path: Path) -> None:
+    known = [block for world in SOME[1:] for block in world.blocks(6)]
+
+    def truthful(x: Tensor) -> Tensor:
+        (same,) = (block for block in known if torch.equal(block.data.data, x))
+        return (same.truth or {})["phase_rad"].nan_to_num()
+
+    found = few(autofocus, SOME[1:])
+    leak = few(truthful, SOME[1:], "leak")
+    assert leak["all"]["merit"][0] == 1 and leak["all"]["over_bound"][0] < 0.01
+    whole = {**records.recorded("autofocus"), "methods": {"leak": leak, "mine": found}}
+    head, _, *lines = show.table(whole).splitlines()
+    assert "below the bound: check for a leak of the truth" in head
+    assert [line.split()[0] for line in lines] == ["mine", "leak"] and lines[1].split()[1:3] == ["*", "-"]
+    assert "leak *" in show.latex(whole) and "below the bound" in show.latex(whole)
+    show.save(whole, [tmp_path / "leak.pdf"])
+    assert "below the bound" not in show.table(records.recorded("autofocus"))
+
+
 def test_cheats_are_exposed() -> None:
     honest = few(autofocus)["all"]
     assert honest["sure_wrong"][0] == 0 and honest["merit"][0] > 0.4
@@ -213,6 +255,24 @@ def test_the_command_scores_beside_records(
     assert {"my_methods:zero", "autofocus", "textbook_pga"} <= set(both)
 
 
+MISTAKEN = """
+class Width:
+    def __init__(self, width): ...
+
+
+def boolean(x):
+    return x.real.sum(-1), x.real.sum((-1, -2)) > 0
+
+
+def named(x):
+    return {"phase_rad": x.real.sum(-1)}
+
+
+def fails(x):
+    return 1 / 0
+"""
+
+
 @pytest.mark.usefixtures("three")
 @pytest.mark.parametrize(
     "words, sentence",
@@ -222,7 +282,16 @@ def test_the_command_scores_beside_records(
         (["other.json"], "other.json is not a record of torchsar bench"),
         (["old.json"], "old.json is a record of version"),
         (["sca", "--out", "mine.doc"], "--out mine.doc: the name must end in .json"),
-        (["recorded", "small.json"], "records of other scenes cannot be compared"),
+        (["recorded", "small.json"], "small.json was made with --small, and recorded was not; run it without"),
+        (["sca", "recorded", "--small"], "this run was made with --small, and recorded was not"),
+        (["drawn.json", "recorded"], "drawn.json was made with --draw 1, and recorded with --draw 0"),
+        (["sca", "--out", "old.json"], "--out old.json: the file exists"),
+        (["nomod:lags"], "'nomod:lags' is no method of autofocus: there is no nomod.py in the working folder"),
+        (["./mistaken.py:boolean"], "give mistaken:boolean"),
+        (["mistaken:Width"], "Width() without arguments (an instance may be given in its place) failed with TypeError"),
+        (["mistaken:boolean"], "std of shape (6, 128), got torch.bool of shape (6,); the order is (value, std, ok)"),
+        (["mistaken:named"], "a method must return phase_rad of shape (6, 128), or (value, std, ok), got dict"),
+        (["mistaken:fails"], "the method fails failed with ZeroDivisionError: division by zero (line 15 of "),
     ],
 )
 def test_mistakes_get_one_sentence(
@@ -233,6 +302,9 @@ def test_mistakes_get_one_sentence(
     (tmp_path / "other.json").write_text("{}")
     (tmp_path / "old.json").write_text(json.dumps({**whole, "version": "2025.1"}))
     (tmp_path / "small.json").write_text(json.dumps({**whole, "small": True}))
+    (tmp_path / "drawn.json").write_text(json.dumps({**whole, "draw": 1}))
+    (tmp_path / "mistaken.py").write_text(MISTAKEN)
+    sys.modules.pop("mistaken", None)
     assert main(["bench", "autofocus", *words, "--trials", "6"]) == 2
     assert sentence in capsys.readouterr().err
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from tests.bench.table import OTHER, SAME, SIMPLE, covered, entries, estimators, idea, limits, missed
-from torchsar.study.bench.frame import NOTHING, joined, row, tried
+from torchsar.study.bench.frame import NOTHING, joined, row, sealed, tried
 from torchsar.study.bench.records import PLACES, bench, recorded
 
 
@@ -109,7 +109,7 @@ CELLS = [
 def test_cells_that_were_wrong(name: str, world: str, snr_db: float | None, least: float) -> None:
     entry = next(entry for _, entry in entries() if entry.name == name)
     (cell,) = [w for w in entry.worlds if (w.name, w.snr_db) == (world, snr_db)]
-    found, _ = tried(replace(entry, worlds=[cell]), cell, cell.blocks(24 if world in NOTHING else 6))
+    found, _ = tried(replace(entry, worlds=[cell]), *sealed(cell.blocks(24 if world in NOTHING else 6)))
     judged = row(joined(found))
     assert judged["ok"][0] >= least and judged["sure_wrong"][0] == 0, judged
     assert judged["calibration"] is None or judged["calibration"] < 3
@@ -119,5 +119,5 @@ def test_wrong_phases_in_noise_are_not_ok() -> None:
     """At -5 dB 7 % had not converged and were ok."""
     entry = next(entry for _, entry in entries() if entry.name == "entropy_fixed_point")
     (cell,) = [w for w in entry.worlds if w.label == "own, -5 dB"]
-    found, _ = tried(entry, cell, cell.blocks(24))
+    found, _ = tried(entry, *sealed(cell.blocks(24)))
     assert not joined(found)["sure_wrong"].any()

@@ -196,14 +196,14 @@ def marks(names: Sequence[str], series: Mapping[str, np.ndarray], xlabel: str, t
     Returns:
         The figure.
     """
-    figure, axes = new_figure(ALONE, 0.9 + 0.24 * len(names))
+    title = wrapped_title(title, 0.7 * ALONE)
+    figure, axes = new_figure(ALONE, 0.9 + 0.24 * len(names) + 0.2 * title.count("\n"))
     for i, (label, rows) in enumerate(series.items()):
         at = -np.arange(len(names)) + 0.12 * (0.5 * (len(series) - 1) - i)
         value, *ends = rows.T
         reach = np.abs(np.stack(ends) - value)
         axes.errorbar(value, at, xerr=reach, fmt=MARKERS[i], color=COLOURS[i], markersize=4, linewidth=1, label=label)
-    axes.set_yticks(-np.arange(len(names)), names)
-    axes.set(xlabel=xlabel, title=wrapped_title(title, 0.7 * ALONE))
+    axes.set(yticks=-np.arange(len(names)), yticklabels=names, xlabel=xlabel, title=title)
     legend_below(figure, axes)
     return figure
 

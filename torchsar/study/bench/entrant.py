@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,27 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Outcome, Stage
+from torchsar.core import Estimate, Outcome, Stage, is_out_of_memory
 from torchsar.study.bench.frame import samples
-from torchsar.study.settings.errors import ConfigError
+from torchsar.study.settings.errors import ConfigError, one_line, own_line
 
 
 class MethodError(TypeError):
     """An error of a method of a user: what it returned, and what was expected."""
+
+
+def _called(what: str, function: Callable[..., Any], *parts: Any, **values: Any) -> Any:
+    """Call what a user wrote; its errors become one sentence with the own line.
+
+    A ValueError of a call is the way to refuse data, and passes.
+    """
+    try:
+        return function(*parts, **values)
+    except Exception as error:
+        if isinstance(error, (MethodError, ValueError)) or is_out_of_memory(error):
+            raise
+        told = f"{type(error).__name__}: {one_line(error) or 'no message'}{own_line(error)}"
+        raise MethodError(f"{what} failed with {told}") from error
 
 
 def loaded(place: str) -> Any:
@@ -28,8 +43,10 @@ def loaded(place: str) -> Any:
         sys.path.insert(0, str(Path.cwd()))
     try:
         return getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError) as error:
-        raise ConfigError(f"the method {place!r} cannot be imported: {error}; give package.module:Name") from error
+    except Exception as error:  # whatever a module of a user raises
+        right = f"{Path(module).stem}:{name}" if module.endswith(".py") else "package.module:Name"
+        told = f"{one_line(error)}{own_line(error)}; give {right}"
+        raise ConfigError(f"the method {place!r} cannot be imported: {told}") from error
 
 
 def entrant(method: Any, name: str, per_pulse: bool = False) -> Callable[..., Estimate]:
@@ -50,29 +67,32 @@ def entrant(method: Any, name: str, per_pulse: bool = False) -> Callable[..., Es
     Raises:
         MethodError: If the method cannot be called; in a call, if it returns something else.
     """
-    made = method() if isinstance(method, type) else method
+    made = method
+    if isinstance(method, type):
+        made = _called(f"{method.__name__}() without arguments (an instance may be given in its place)", method)
     if not callable(made):
         raise MethodError(f"a method must be a class, module or function, got {type(made).__name__}")
+    called = f"the method {getattr(made, '__name__', type(made).__name__)}"
     if isinstance(made, Stage):
-        return made
+        return partial(_called, called, made)
     kinds: list[Callable[[Tensor], Any]] = [torch.Tensor.clone, lambda x: x.detach().cpu().numpy().copy()]
 
     def run(data: Any, **values: Any) -> Estimate:
         x = samples(data)
         try:
-            out = made(kinds[0](x), **values)
+            out = _called(called, made, kinds[0](x), **values)
         except Exception as first:
             if len(kinds) == 1:
                 raise
             try:
                 out = made(kinds[1](x), **values)
             except Exception:
-                raise first from None
+                raise first from first.__cause__
             del kinds[0]
         else:
             if len(kinds) > 1 and _holds_arrays(out):
                 del kinds[0]
-                out = made(kinds[0](x), **values)
+                out = _called(called, made, kinds[0](x), **values)
         del kinds[1:]
         return _estimate(out, name, x, per_pulse)
 
@@ -88,13 +108,23 @@ def _estimate(out: Any, name: str, x: Tensor, per_pulse: bool) -> Estimate:
     for part in parts:
         if isinstance(part, Estimate):
             return part
-    three = (*parts, None, None)[:3]
-    value, std, ok = (None if part is None else torch.as_tensor(part).detach().cpu() for part in three)
     shape = tuple(x.shape[:2] if per_pulse else x.shape[:1])
+    three = (*parts, None, None)[:3]
+    try:
+        value, std, ok = (None if part is None else torch.as_tensor(part).detach().cpu() for part in three)
+    except (TypeError, ValueError, RuntimeError) as error:
+        kinds = ", ".join(type(part).__name__ for part in three if part is not None)
+        raise MethodError(f"a method must return {name} of shape {shape}, or (value, std, ok), got {kinds}") from error
     if value is None or value.shape[: len(shape)] != shape or (per_pulse and value.ndim > 2) or value.is_complex():
         got = type(out).__name__ if value is None else f"{value.dtype} of shape {tuple(value.shape)}"
         expected = f"real values {name} of shape {shape} for data {tuple(x.shape)}"
         raise MethodError(f"a method must return {expected}, got {got}")
+    each = (*shape[:1], *(1,) * (value.ndim - 1))
+    for what, part, shapes in (("std", std, (value.shape, each, ())), ("ok", ok, (shape[:1], ()))):
+        if part is not None and (part.shape not in shapes or (part is std and part.dtype == torch.bool)):
+            got = f"{part.dtype} of shape {tuple(part.shape)}"
+            told = f"a method must return {what} of shape {tuple(shapes[0])}, got {got}"
+            raise MethodError(f"{told}; the order is (value, std, ok), and std may be None")
     value = value.double()
     finite = torch.isfinite(value).reshape(len(value), -1).all(-1)
     good = finite if ok is None else finite & ok.bool()

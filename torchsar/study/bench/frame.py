@@ -7,6 +7,7 @@ world draws data by a fixed seed and gives the truth, or says that there is noth
 from __future__ import annotations
 
 import math
+import pickle
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -62,6 +63,12 @@ class Batch:
             truth = None if self.truth is None else {name: cut(value, at) for name, value in self.truth.items()}
             values = {name: cut(value, at) for name, value in self.values.items()}
             yield Batch(cut(self.data, at), truth, values, cut(self.clean, at))
+
+
+def sealed(blocks: Sequence[Batch]) -> tuple[list[Batch], bytes]:
+    """Blocks without their truth, and the truth as bytes: no frame above a method holds it."""
+    hidden = [(block.truth, block.clean) for block in blocks]
+    return [replace(block, truth=None, clean=None) for block in blocks], pickle.dumps(hidden)
 
 
 def samples(data: Any) -> Tensor:
@@ -216,14 +223,15 @@ def pair_seconds(x: Tensor, least: float = 0.01) -> float:
 
 
 def tried(
-    entry: Entry, world: World, blocks: Sequence[Batch], scores: Scores | None = None, batch: int = BLOCK
+    entry: Entry, blocks: Sequence[Batch], truth: bytes, scores: Scores | None = None, batch: int = BLOCK
 ) -> tuple[list[Numbers], str | None]:
-    """Run a method in a world.
+    """Run a method on `sealed` blocks of a world. The truth is opened after its last call.
 
     Returns the numbers of each block, the processor time of the method (`time:method`) and that of
     bare transforms (`time:pairs`) among them, and the sentence with which the method refuses.
     """
-    found, sentence = [], None
+    answers: list[tuple[Estimate, Numbers] | None] = []
+    sentence = None
     for part in (part for block in blocks for part in block.parts(batch)):
         began = time.process_time()
         try:
@@ -232,12 +240,18 @@ def tried(
                 estimate = estimate_of(entry.run(part.data, **part.values))
         except ValueError as refusal:
             sentence = str(refusal)
-            found.append(refused(part))
+            answers.append(None)
             continue
         spent = time.process_time() - began
         pair = pair_seconds(samples(part.data))
         times = {"time:method": torch.tensor([spent]), "time:pairs": torch.tensor([pair])}
-        found.append(counted(entry, part, estimate, scores) | times)
+        answers.append((estimate, times))
+    pairs = zip(blocks, pickle.loads(truth), strict=True)
+    whole = (replace(block, truth=values, clean=clean) for block, (values, clean) in pairs)
+    found = [
+        refused(part) if answer is None else counted(entry, part, answer[0], scores) | answer[1]
+        for part, answer in zip((part for block in whole for part in block.parts(batch)), answers, strict=True)
+    ]
     return found, sentence
 
 
@@ -314,12 +328,12 @@ def scored(
     for world in worlds:
         say(world.label, len(worlds))
         counts = {e.name: _count(e, trials, small) for e in entries if any(world is own for own in e.worlds)}
-        drawn = {count: world.blocks(count, draw=draw) for count in set(counts.values())}
+        drawn = {count: sealed(world.blocks(count, draw=draw)) for count in set(counts.values())}
         for entry in (entry for entry in entries if entry.name in counts):
-            blocks, method = drawn[counts[entry.name]], methods[entry.name]
+            (blocks, truth), method = drawn[counts[entry.name]], methods[entry.name]
             if "memory" not in method:
                 method["memory"] = _memory(entry, blocks[0])
-            found, sentence = tried(entry, world, blocks, bench.scores, batch)
+            found, sentence = tried(entry, blocks, truth, bench.scores, batch)
             parts[entry.name][world.label] = numbers = joined(found)
             method["worlds"][world.label] = row(numbers) | ({"refused": sentence} if sentence else {})
     for entry in entries:

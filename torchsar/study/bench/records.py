@@ -129,7 +129,9 @@ def score(
     entries: list[Entry] = []
     for label, method in (dict.fromkeys(known) if methods is None else methods).items():
         if method is None and label not in known:
-            told = f"give package.module:Name, or one of {', '.join(known)}"
+            module, colon, _ = label.rpartition("=")[2].partition(":")
+            missing = f"there is no {module}.py in the working folder; " if colon and module not in known else ""
+            told = f"{missing}give package.module:Name, or one of {', '.join(known)}"
             raise ConfigError(f"{label!r} is no method of {name}: {told}")
         if method is None:
             entries.append(known[label])
@@ -176,13 +178,23 @@ def read(path: Path) -> Record:
     return record
 
 
+def same_scenes(records: Mapping[str, Mapping[str, Any]]) -> None:
+    """Refuse records by name that are not of the same scenes, with what differs."""
+    first, *others = records.items()
+    for other in others:
+        (name, mine), (beside, theirs) = sorted((first, other), key=lambda one: (not one[1]["small"], -one[1]["draw"]))
+        if mine["bench"] != theirs["bench"]:
+            raise ConfigError(f"{name} is of the benchmark {mine['bench']}, and {beside} of {theirs['bench']}")
+        if mine["small"] != theirs["small"]:
+            raise ConfigError(f"{name} was made with --small, and {beside} was not; run it without")
+        if mine["draw"] != theirs["draw"]:
+            told = f"{name} was made with --draw {mine['draw']}, and {beside} with --draw {theirs['draw']}"
+            raise ConfigError(f"{told}; run both with the same")
+
+
 def together(records: Sequence[Record]) -> Record:
     """Join the methods of records, of which the later ones replace methods of the same name."""
-    keys = ("bench", "small", "draw")
-    for other in records[1:]:
-        if any(other[key] != records[0][key] for key in keys):
-            told = [{key: record[key] for key in keys} for record in (records[0], other)]
-            raise ConfigError(f"records of other scenes cannot be compared: {told[0]} and {told[1]}")
+    same_scenes({f"record {i} ({', '.join(list(one['methods'])[:3])})": one for i, one in enumerate(records, 1)})
     methods = {name: method for record in records for name, method in record["methods"].items()}
     return {**records[0], "methods": methods}
 

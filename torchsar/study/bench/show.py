@@ -26,10 +26,24 @@ COLUMNS = (
 )
 
 
+LEAK = "below the bound: check for a leak of the truth"
+
+
 def ranked(record: Record) -> list[tuple[str, dict[str, Any]]]:
-    """Names and sums of the methods, those of the greatest merit first."""
+    """Names and sums of the methods, those of the greatest merit first.
+
+    Those far below the bound, which no method without bias can be, have no merit and are the last.
+    """
     rows = [(name, method["all"] | {"memory": method.get("memory")}) for name, method in record["methods"].items()]
-    return sorted(rows, key=lambda pair: -pair[1]["merit"][0])
+    rows = sorted(rows, key=lambda pair: -pair[1]["merit"][0])
+    honest = [(name, row) for name, row in rows if not _leaks(row)]
+    return honest + [(f"{name} *", row | {"merit": [None] * 3}) for name, row in rows if _leaks(row)]
+
+
+def _leaks(row: dict[str, Any], least: float = 0.5) -> bool:
+    # the median of a method at the bound is 1 within some percent
+    median = row.get("over_bound", [None])[0]
+    return median is not None and median < least
 
 
 def cells(record: Record) -> list[list[str]]:
@@ -56,9 +70,11 @@ def about(record: Record) -> str:
     worlds = max(len(method["worlds"]) for method in record["methods"].values())
     other = f", draw {record['draw']}" if record["draw"] else ""
     small = ", reduced" if record["small"] else ""
+    leaks = any(_leaks(method["all"]) for method in record["methods"].values())
     return (
         f"torchsar bench {record['bench']}, version {record['version']}, checksum {record['checksum']}: "
         f"{worlds} worlds, {trials} trials{small}{other}"
+        f"{f'; * {LEAK}' if leaks else ''}"
     )
 
 
@@ -98,6 +114,15 @@ def figure(record: Record) -> Any:
     return plot.marks([name for name, _ in rows], series, "of all trials, with 95 % intervals", about(record))
 
 
+def new_files(files: Sequence[Path]) -> None:
+    """Refuse names of files that exist, or end in what is not written."""
+    for path in files:
+        if path.suffix not in (".json", ".tex", ".txt", ".pdf", ".png", ".svg"):
+            raise ConfigError(f"--out {path}: the name must end in .json, .tex, .txt, .pdf, .png or .svg")
+        if path.exists():
+            raise ConfigError(f"--out {path}: the file exists; give another name, or move it away")
+
+
 def save(record: Record, files: Sequence[Path | str]) -> None:
     """Write a record (.json), its table (.tex, .txt) or its figure (.pdf, .png, .svg)."""
     for path in map(Path, files):
@@ -108,9 +133,7 @@ def save(record: Record, files: Sequence[Path | str]) -> None:
             path.write_text(
                 latex(record) if path.suffix == ".tex" else f"{table(record, ends=True)}\n", encoding="utf-8"
             )
-        elif path.suffix in (".pdf", ".png", ".svg"):
+        else:
             from torchsar import plot
 
             plot.save(figure(record), path)
-        else:
-            raise ConfigError(f"--out {path}: the name must end in .json, .tex, .txt, .pdf, .png or .svg")
