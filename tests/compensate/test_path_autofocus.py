@@ -21,7 +21,7 @@ from torchsar.echo import simulate_path
 from torchsar.focus import ImageGrid, TileImage, TilePlan
 from torchsar.focus.tile_operator import TileOperator
 from torchsar.metrics import phase_rmse, registered_error_db
-from torchsar.radar import AntennaPath, InverseRadar
+from torchsar.radar import AntennaPath, InverseRadar, range_profiles
 from torchsar.scene import Flight, Navigation, PathWorld, RandomPoints, RandomWalk, Sinusoid, StraightPath, Sway
 
 F64 = torch.float64
@@ -47,6 +47,33 @@ def white(trials: int, seed: int = 5) -> torch.Tensor:
 
 def turned(data: torch.Tensor, phase: torch.Tensor) -> torch.Tensor:
     return data * unit_phasor(phase / (2 * math.pi), data.dtype)[..., None]
+
+
+@pytest.mark.slow
+def test_cars_in_motions_of_their_own_are_named() -> None:
+    """An exact path and 60 points; with three cars, three of the points move and are brighter."""
+    time = torch.linspace(-1, 1, 200, dtype=F64)
+    sway = [-2000 + 0.4 * torch.sin(7 * time) + 0.3 * torch.cos(13 * time), 1200 + 0.5 * torch.sin(5 * time + 1)]
+    place = torch.stack([45 * time, *sway], -1)
+    frequency = 9.4e9 + 4e6 * (torch.arange(64, dtype=F64) - 32)
+    antennas = AntennaPath(place, None, 2 * torch.linalg.vector_norm(place, dim=-1))
+    draws = Draws(1)
+    points = torch.cat([draws.uniform("place", (60, 2), -12, 12), torch.zeros(60, 1, dtype=F64)], -1)
+    amplitude = draws.normal("amplitude", (60,), torch.complex128)
+    noise = draws.normal("noise", (200, 64), torch.complex128)
+    for times in (0.0, 12.0):
+        speed, weight = torch.zeros(60, 3, dtype=F64), amplitude.clone()
+        if times:
+            speed[:3] = torch.tensor([[3.0, 0.7, 0.0], [-2.0, 0.2, 0.0], [3.0, 0.7, 0.0]]).to(F64)
+            weight[:3] *= times
+        at = points + 1.5 * time[:, None, None] * speed
+        path = 2 * torch.linalg.vector_norm(place[:, None] - at, dim=-1) - antennas.reference_m[:, None]
+        turns = -path[..., None] * frequency / 299792458.0
+        history = (weight[:, None] * unit_phasor(turns, torch.complex128)).sum(1)
+        data = history + history.abs().square().mean().sqrt() * noise
+        found = path_autofocus(range_profiles(data).to(torch.complex64), frequency, antennas)
+        assert bool(found.ok) == (not times)
+        assert not times or int(found.outcome) == Outcome.PARTS_DISAGREE
 
 
 def test_the_operator_has_its_adjoint() -> None:

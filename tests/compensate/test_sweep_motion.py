@@ -131,14 +131,16 @@ def test_a_radar_without_a_length_of_sweeps_is_refused():
         echo.simulate_path(bare, world, 8, 16, Draws(1))
 
 
-def test_trials_have_paths_of_their_own():
+@pytest.mark.parametrize("squint_deg", [None, 12.0])
+def test_trials_have_paths_of_their_own(squint_deg):
     recording = flown(12.0)
     data, aux = recording.signal.data, recording.aux
-    moved = aux["transmitter_m"] + torch.tensor([0.0, 0.0, 0.5]) * torch.linspace(-1, 1, PULSES)[:, None].double()
+    moved = aux["transmitter_m"] + torch.tensor([2.0, 0.0, 0.5]) * torch.linspace(-1, 1, PULSES)[:, None].double()
     places, reference = torch.stack([aux["transmitter_m"], moved]), aux["path_reference_m"]
     both = AntennaPath(places, None, reference.expand(2, -1))
-    found = compensate.correct_sweep_motion(torch.stack([data, data]), FMCW, both)
+    found = compensate.correct_sweep_motion(torch.stack([data, data]), FMCW, both, squint_deg=squint_deg)
     for trial, place in enumerate(places):
-        alone = compensate.correct_sweep_motion(data, FMCW, AntennaPath(place, None, reference))
+        path = AntennaPath(place, None, reference)
+        alone = compensate.correct_sweep_motion(data, FMCW, path, squint_deg=squint_deg)
         torch.testing.assert_close(found[trial], alone, rtol=0, atol=1e-9)
-    assert error_db(found[1], found[0]) > -60  # it climbs by 1 m
+    assert error_db(found[1], found[0]) > -60  # it climbs by 1 m and nears by 4 m

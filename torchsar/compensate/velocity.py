@@ -208,13 +208,15 @@ def minimum_entropy_velocity(
 def _scale_m_s(
     objective: Callable[[Tensor], Tensor], velocity_m_s: Tensor, least_m_s: float, most_m_s: float
 ) -> Tensor:
-    """Distance from a minimum (...,) in m/s that exceeds its half width, up to four times.
+    """Distance from a minimum (...,) in m/s that is about four times its half width.
 
-    Distances grow by factors of four. Within the width the entropy grows with the square of the
-    distance, by sixteen from one to the next, and beyond it with the logarithm. The result is the
-    largest distance at which it is more than four times that of the next smaller one. Going from
-    large to small ones, the entropy of noise, whose minima are as narrow as the least distance, is
-    met only where there is no wider minimum.
+    The entropy is compared at distances that grow by factors of four. Within the width it grows
+    with the square of the distance, by sixteen from one to the next, and beyond it with the
+    logarithm. The first distance beyond the width is the largest whose entropy is more than four
+    times that of the one before. Going from large to small ones, the entropy of noise, whose
+    minima are as narrow as the least distance, is met only where there is no wider minimum. The
+    width w follows from the growth to the next distance, for an entropy that rises with
+    d^2 / (w^2 + d^2).
 
     Args:
         objective: Entropy (...,) for a velocity (...,).
@@ -226,10 +228,15 @@ def _scale_m_s(
     distances = [least_m_s * 4.0**k for k in range(levels)]
     least = objective(velocity_m_s)
     rise = [(objective(velocity_m_s - d) + objective(velocity_m_s + d)) / 2 - least for d in distances]
-    found = torch.full_like(velocity_m_s, least_m_s)
-    for below, above, distance in zip(rise, rise[1:], distances[1:], strict=False):
-        found = torch.where(above > 4 * below, distance, found)
-    return found
+    growth = [(above / below.clamp_min(1e-12)).clamp(1, 16) for below, above in zip(rise, rise[1:], strict=False)]
+    # beyond the largest distance the growth is not known; the result is this distance then
+    growth.append(torch.ones_like(least))
+    found, after = torch.full_like(velocity_m_s, least_m_s), growth[0]
+    for k in range(1, levels):
+        wider = growth[k - 1] > 4
+        found, after = torch.where(wider, distances[k], found), torch.where(wider, growth[k], after)
+    times = 16 * ((after - 1) / (16 - after).clamp_min(1e-12)).sqrt()  # 4 w over the distance
+    return (found * times.clamp(1, 8)).clamp_max(most_m_s)
 
 
 def _search(

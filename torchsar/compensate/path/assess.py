@@ -1,7 +1,8 @@
 """Assessment of errors of a path: their standard deviation, quality and outcome.
 
 Is the image sharper than noise can be made? Do several starts agree, and have the phases hardly
-changed in the last round? Is the standard deviation small enough for a focused image?
+changed in the last round? Is the standard deviation small enough for a focused image? Does no block
+of neighbouring ranges get sharper with errors of its own than noise explains?
 """
 
 from __future__ import annotations
@@ -12,7 +13,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from torchsar.compensate.path.ground import FINE_STEP
 from torchsar.compensate.path.search import Search, Starts, sharpness
+from torchsar.compensate.pulse_phase.parts import gain_of_parts
 from torchsar.core import Estimate, Outcome, worst
 
 # The Strehl ratio for an error of _SPREAD standard deviations must be at least LEAST_STREHL, the
@@ -68,9 +71,17 @@ def of_path(found: Estimate, starts: Starts, search: Search) -> Estimate:
     std = (best.std_m.square() + (starts.square_m2 / (1 + (other / best.noise).square())).amin()).sqrt()
     doubt = best.std_m.square().mean() + starts.square_m2.amin() / 2
     sharp, noise = sharpness(best.image)
+    # The middle of the spectrum over azimuth, which the echoes occupy, is that of pulses without
+    # range migration.
+    rows = torch.fft.fftshift(torch.fft.fft(best.image.mT[None]), dim=-1)
+    beside = round(rows.shape[-1] * (1 - FINE_STEP) / 2)
+    rows = rows[..., beside : rows.shape[-1] - beside].contiguous()
+    zero = torch.zeros_like(rows[:, 0].real)
+    gain = gain_of_parts(rows, zero == 0, zero)[0]
     most = _WORSE * starts.noise + _UNFIT * search.rows.abs().square().double().mean()
     outcome = worst(
         (Outcome.INEXACT, strehl(doubt, search.fringe_m, _SPREAD) <= LEAST_STREHL),
+        (Outcome.PARTS_DISAGREE, gain > 2.2),  # the limit of phases of pulses
         (Outcome.AMBIGUOUS, best.noise > most),
         (Outcome.NOT_CONVERGED, best.restless > RESTLESS),
         # the factor is larger than the 1.5 for phases of pulses, because envelopes and three axes

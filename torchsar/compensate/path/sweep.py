@@ -6,9 +6,10 @@ import math
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from torchsar.core import Signal, Stage, unit_phasor
-from torchsar.radar import AntennaPath, InverseRadar, StraightTrack, frequency_samples, range_profiles
+from torchsar.radar import AntennaPath, InverseRadar, frequency_samples, range_profiles
 
 
 def correct_sweep_motion(
@@ -73,10 +74,13 @@ def correct_sweep_motion(
     point = antennas.reference_m.new_tensor(centre_m)
     if squint_deg is not None:
         place = antennas.places[-1]
-        track = StraightTrack.fitted(place.detach().reshape(-1, pulses, 3).mean(0))
-        abeam = track.abeam_m(place, point)
+        # the straight track of each trial, by least squares, and its level part
+        order = torch.linspace(-1, 1, pulses, dtype=place.dtype, device=place.device)[:, None]
+        along = normalize((order * place.detach()).sum(-2, keepdim=True), dim=-1)
+        level = normalize(along * along.new_tensor([1.0, 1.0, 0.0]), dim=-1)
+        abeam = point + ((place - point) * level).sum(-1, keepdim=True) * level
         ahead = torch.linalg.vector_norm(place - abeam, dim=-1, keepdim=True) * math.tan(math.radians(squint_deg))
-        point = abeam + ahead * track.along
+        point = abeam + ahead * along
     rate = torch.zeros_like(antennas.reference_m)
     for place in (antennas.places * 2)[:2]:
         away = place - point
