@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -228,7 +229,7 @@ def _scale_m_s(
     distances = [least_m_s * 4.0**k for k in range(levels)]
     least = objective(velocity_m_s)
     rise = [(objective(velocity_m_s - d) + objective(velocity_m_s + d)) / 2 - least for d in distances]
-    growth = [(above / below.clamp_min(1e-12)).clamp(1, 16) for below, above in zip(rise, rise[1:], strict=False)]
+    growth = [(above / below.clamp_min(1e-12)).clamp(1, 16) for below, above in pairwise(rise)]
     # beyond the largest distance the growth is not known; the result is this distance then
     growth.append(torch.ones_like(least))
     found, after = torch.full_like(velocity_m_s, least_m_s), growth[0]
