@@ -49,7 +49,8 @@ def assessed_velocity(found: Estimate, measured: Measured, pulse: Axis, sweeps: 
 
         - INEXACT where the SNR after compression is too low for peaks that exceed the noise in all
           periods, or the standard deviation exceeds 0.035 lambda / T (T is the length of a sweep);
-        - PARTS_DISAGREE where a part of the echo has another velocity (`_one_sided`);
+        - PARTS_DISAGREE where a part of the echo has another velocity (`_one_sided`), unless a
+          constant explains it;
         - AMBIGUOUS where both sweeps have more power in common at another velocity, in more than
           one period of 20;
         - AT_REST where a constant holds more than a fifth of the energy, and the velocity is about
@@ -73,7 +74,9 @@ def assessed_velocity(found: Estimate, measured: Measured, pulse: Axis, sweeps: 
     useless = mean_of(square, product.lit)[..., 0] >= (0.07 * bin_m_s) ** 2
     outcome = worst(
         (Outcome.INEXACT, ~measured.enough | useless),
-        (Outcome.PARTS_DISAGREE, _one_sided(lines, lit)),
+        # A constant of more than half a percent of the energy causes such lines, too. Up to a fifth
+        # it does not change the velocity.
+        (Outcome.PARTS_DISAGREE, _one_sided(lines, lit) & (share < 0.005)),
         (Outcome.AMBIGUOUS, (best.squared >= LEAST_SQUARED) & (elsewhere > 0.05)),
         (Outcome.AT_REST, (share > 0.2) & (still > 0.05)),
         # below 9 dB, noise alone may cause the peak of the product of both sweeps, by trial
