@@ -188,6 +188,7 @@ def minimum_entropy_velocity(
     if group.radar.integration_s is None:
         with torch.no_grad():
             half = _scale_m_s(objective, value.detach(), 2 * min(step, nominal / 18), nominal * 4 / 9) / 20
+        half = half.detach()  # derivatives in forward mode are not stopped by no_grad
     parts = [_parts(spectrum, doppler_hz, weight, value + side * half) for side in (-1, 0, 1)]
     rows, (low, middle, high), shares = zip(*parts, strict=True)
     curvature = (low - 2 * middle + high).sum((-2, -1)) / half.square()

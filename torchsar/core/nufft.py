@@ -196,7 +196,8 @@ class Points:
             rest = rest + shift
             further = torch.round(rest.detach())
             whole, rest = whole + further, rest - further
-        first = (whole - length * torch.floor(whole / length)).to(torch.int64)
+        # NaN, which checks refuse later, must not become an index
+        first = (whole - length * torch.floor(whole / length)).nan_to_num(0.0).to(torch.int64)
         return Points(first, kernel.weights(rest))
 
 

@@ -48,7 +48,8 @@ def plain_files(path: Path) -> list[Path]:
     """
     found = sorted(path.rglob("*"))
     for one in found:
-        if one.is_symlink() or not (one.is_dir() or one.is_file()):
+        # one that another thread has renamed since it was listed is none of them
+        if one.is_symlink() or (one.exists() and not (one.is_dir() or one.is_file())):
             raise ValueError(f"{one.relative_to(path)} is a link or no plain file")
     return [one for one in found if one.is_file()]
 
