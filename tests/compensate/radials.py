@@ -8,7 +8,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from tests.echo.ladars import COMMON, table1
+from tests.echo.ladars import COMMON
 from torchsar.compensate import (
     mirror_product,
     ml_peak,
@@ -21,6 +21,7 @@ from torchsar.core import Axis, Draws, Estimate, Truth
 from torchsar.echo import simulate_ladar
 from torchsar.radar import TriangularLadar, sweep_middles
 from torchsar.scene import EverySample, LadarWorld, Points
+from torchsar.study.bench.direct.triangles import table1
 
 ESTIMATORS: dict[str, Callable[..., Estimate]] = {
     "segmented": segmented_interference,

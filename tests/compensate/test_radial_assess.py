@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from tests.compensate.radials import ESTIMATORS, GATE, seen, velocity_rms
-from tests.echo.ladars import table1
 from torchsar.compensate import MirrorProduct, RadialMotion, phase_polish, pulse_gain, radial_motion
 from torchsar.compensate.radial import assess, blocks, recommended
 from torchsar.core import Outcome, Signal
 from torchsar.scene import LetterE, LinearInSweep, Points, Polynomial, Sinusoid
+from torchsar.study.bench.direct.triangles import table1
 
 RADAR = table1()
 IDS = list(ESTIMATORS)

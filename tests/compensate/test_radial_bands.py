@@ -8,10 +8,11 @@ import pytest
 import torch
 
 from tests.compensate.radials import ESTIMATORS, GATE, seen
-from tests.echo.ladars import COMMON, table1
+from tests.echo.ladars import COMMON
 from torchsar.compensate.radial.bands import Spectra, filled, window_lines
 from torchsar.radar import LIGHT_M_S
 from torchsar.scene import LinearInSweep, Points, Polynomial
+from torchsar.study.bench.direct.triangles import table1
 
 RADAR = table1()
 

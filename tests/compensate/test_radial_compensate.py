@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from tests.compensate.radials import GATE, rms, seen, without_line
-from tests.echo.ladars import COMMON, direct_sweeps, table1
+from tests.echo.ladars import COMMON, direct_sweeps
 from torchsar.compensate import compensate_motion, radial_motion, range_error
 from torchsar.compensate.radial.trajectory import (
     integrated_range,
@@ -21,6 +21,7 @@ from torchsar.focus import compress_sweeps
 from torchsar.radar import sweep_middles
 from torchsar.scene import Polynomial, Scatterers
 from torchsar.scene.vibration import displacement_m
+from torchsar.study.bench.direct.triangles import table1
 
 RADAR = table1()
 

@@ -6,10 +6,11 @@ import pytest
 import torch
 
 from tests.compensate.radials import ESTIMATORS, GATE, ONE, rms, seen, velocity_rms
-from tests.echo.ladars import COMMON, table1
+from tests.echo.ladars import COMMON
 from torchsar.compensate.radial.beats import from_beats
 from torchsar.compensate.radial.trajectory import geometric_velocity_m_s
 from torchsar.scene import Points, Polynomial
+from torchsar.study.bench.direct.triangles import table1
 
 RADAR = table1()
 # rms error without noise in m/s: only grids and summed bins leave a noticeable one

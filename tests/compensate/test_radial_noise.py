@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from tests.compensate.radials import ESTIMATORS, range_rms, seen, velocity_rms
-from tests.echo.ladars import table1
 from torchsar.compensate import radial_motion
 from torchsar.metrics import (
     integrated_range_detrended_bound_m,
@@ -15,6 +14,7 @@ from torchsar.metrics import (
     velocity_known_offset_bound_m_s,
 )
 from torchsar.scene import LetterE, LinearInSweep, Points, Polynomial, Sinusoid, Speckle
+from torchsar.study.bench.direct.triangles import table1
 
 RADAR = table1()
 GATE = (1.5 - 20 * RADAR.range_step_m, 1.5 + 20 * RADAR.range_step_m)

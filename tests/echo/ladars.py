@@ -7,10 +7,11 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.radar import LIGHT_M_S, TriangularLadar
+from torchsar.radar import TriangularLadar
 from torchsar.scene import Points, Polynomial, RetroAndBrokenLine, Scatterers, Sinusoid
 from torchsar.scene.ladar import SweepError
 from torchsar.scene.vibration import displacement_m
+from torchsar.study.bench.direct.triangles import ground
 
 DOUBLE = torch.complex128
 THREE = Points([-0.06, 0.0, 0.06], [1.0, 1.5, 2.0], [0.7, 1.0, 0.7])
@@ -28,30 +29,9 @@ GROUND = (
 )
 
 
-def table1(**changes) -> TriangularLadar:
-    """The simulated ladar of Remote Sens. 2024, 16, 793, Table 1."""
-    values: dict = {
-        "carrier_hz": LIGHT_M_S / 1.55e-6,
-        "bandwidth_hz": 5e9,
-        "period_s": 16e-6,
-        "sample_rate_hz": 64e6,
-        "speed_m_s": 60.0,
-        "reference_range_m": 3000.0,
-    }
-    return TriangularLadar(**{**values, **changes})
-
-
 def table4(**changes) -> TriangularLadar:
     """The ground experiment of Table 4: real detection, every fourth period."""
-    values: dict = {
-        "period_s": 32e-6,
-        "sample_rate_hz": 150e6,
-        "speed_m_s": 3.125,
-        "reference_range_m": 4339.5,
-        "keep_every": 4,
-        "detection": "real",
-    }
-    return table1(**{**values, **changes})
+    return ground(**{"keep_every": 4, **changes})
 
 
 def unit_retro(draws) -> Scatterers:

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.echo.ladars import COMMON, DOUBLE, THREE, direct_sweeps, table1, table4
+from tests.echo.ladars import COMMON, DOUBLE, THREE, direct_sweeps, table4
 from torchsar.core import Draws, Recording
 from torchsar.echo import PolynomialSweepError, SinusoidSweepError, ladar_echo, simulate_ladar
 from torchsar.echo.sweep_error import calibration_channel
@@ -35,6 +35,7 @@ from torchsar.scene import (
 )
 from torchsar.scene.ladar_range import Extremes
 from torchsar.scene.vibration import displacement_m
+from torchsar.study.bench.direct.triangles import table1
 
 FAST = (Polynomial([5.0, 100.0]),)
 

@@ -15,7 +15,6 @@ from tests.echo.ladars import (
     THREE,
     direct_record,
     direct_sweeps,
-    table1,
     table4,
     triangle_turns,
     unit_retro,
@@ -40,6 +39,7 @@ from torchsar.scene import (
     Sinusoid,
 )
 from torchsar.scene.vibration import displacement_m
+from torchsar.study.bench.direct.triangles import table1
 
 COMPLEX4 = table4(detection="complex")
 

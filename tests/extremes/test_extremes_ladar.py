@@ -11,11 +11,11 @@ import pytest
 import torch
 
 from tests.compensate.radials import ESTIMATORS, GATE, seen, velocity_rms
-from tests.echo.ladars import table1
 from torchsar.compensate import compensate_motion, radial_motion
 from torchsar.core import Estimate, Signal
 from torchsar.focus import AzimuthMatchedFilter, CompressSweeps, DerampAzimuth
 from torchsar.scene import LinearInSweep, Points, Polynomial
+from torchsar.study.bench.direct.triangles import table1
 
 RADAR = table1()
 IDS = list(ESTIMATORS)

@@ -10,11 +10,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.echo.ladars import DOUBLE, direct_sweeps, table1
+from tests.echo.ladars import DOUBLE, direct_sweeps
 from torchsar.core import Axis, Signal
 from torchsar.focus import AzimuthMatchedFilter, CompressSweeps, azimuth_matched_filter, compress_sweeps, deramp_azimuth
 from torchsar.focus.triangular import profile_axes, video_filter
 from torchsar.scene import Polynomial, Scatterers
+from torchsar.study.bench.direct.triangles import table1
 
 RADAR = table1(speed_m_s=0.0)
 MOVING = table1()

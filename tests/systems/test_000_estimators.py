@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from tests.compensate.radials import ESTIMATORS, GATE, range_rms, seen, velocity_rms
-from tests.echo.ladars import COMMON, THREE, table1
+from tests.echo.ladars import COMMON, THREE
 from torchsar.compensate import correct_pulse_phase, pga
 from torchsar.compensate.radial import (
     compensate_motion,
@@ -28,6 +28,7 @@ from torchsar.metrics import impulse_response
 from torchsar.radar import sweep_middles
 from torchsar.repair import CircularShift, SplitSweeps
 from torchsar.scene import EverySample, LadarWorld, LetterE, LinearInSweep, Points, Polynomial, QuadraticInSweep
+from torchsar.study.bench.direct.triangles import table1
 
 RADAR = table1()
 

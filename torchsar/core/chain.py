@@ -291,7 +291,7 @@ class Chain(Shown, nn.Module):
                 both estimates and corrects has one, since it cannot be repeated with another value;
                 or if `of` is a text, or `pairs` is less than 1.
         """
-        return spread_of(self, trace, of, pairs)
+        return spread_of(trace, self.retrace, self.uses, self.in_doubt, of, pairs)
 
     def _start(
         self, x: Recording | Signal | None, given: Given | None, draws: Draws | None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -15,8 +15,9 @@ from torchsar.core.estimate import Estimate, Outcome
 from torchsar.core.show import Shown, Summary, content
 
 if TYPE_CHECKING:
-    from torchsar.core.chain import Chain
     from torchsar.core.trace import Trace
+
+Uses = Mapping[str, Mapping[str, str]]
 
 
 @dataclass(frozen=True, repr=False)
@@ -97,12 +98,21 @@ class _Error:
         return mask[(..., *(None,) * (self.estimate.std[self.key].ndim - mask.ndim))]
 
 
-def spread_of(chain: Chain, trace: Trace, of: Collection[str] | None, pairs: int) -> Spread:
+def spread_of(
+    trace: Trace,
+    retrace: Callable[[Trace, str, Mapping[str, Any]], Trace],
+    uses: Uses,
+    in_doubt: Mapping[str, str],
+    of: Collection[str] | None,
+    pairs: int,
+) -> Spread:
     """Carry the errors of estimates to pixels and metrics; see `Chain.spread`.
 
     Args:
-        chain: The chain.
-        trace: Its trace.
+        trace: Trace of a chain.
+        retrace: Repeats stages of the chain from one on, with given values, see `Chain.retrace`.
+        uses: Sources of the values that each stage of the chain uses, see `Chain`.
+        in_doubt: What each stage does with doubtful estimates, see `Chain`.
         of: Names of the estimates whose errors count; None for all.
         pairs: Largest number of pairs of directions.
 
@@ -111,7 +121,7 @@ def spread_of(chain: Chain, trace: Trace, of: Collection[str] | None, pairs: int
     """
     if not isinstance(pairs, int) or pairs < 1:
         raise ValueError(f"`pairs` must be a whole number of at least 1, got {pairs!r}; 32 is the default")
-    errors, start = _errors(chain, trace, of)
+    errors, start = _errors(trace, uses, in_doubt, of)
     # values with factors share the signs of their estimate
     slots = {(name, "" if key in x.estimate.factor else key): x.signs for (name, key), x in errors.items()}
     sizes = [math.prod(shape) for shape in slots.values()]
@@ -129,7 +139,7 @@ def spread_of(chain: Chain, trace: Trace, of: Collection[str] | None, pairs: int
             for (name, key), x in errors.items():
                 error = x.with_signs(parts[name, "" if key in x.estimate.factor else key])
                 given[name] = replace(given[name], value={**given[name].value, key: x.estimate.value[key] + error})
-            again = chain.retrace(trace, start, given)
+            again = retrace(trace, start, given)
             for name, x in {"": again.signal.data.abs(), **again.metrics}.items():
                 change = x.to(torch.promote_types(x.dtype, torch.float32)) - plain[name]
                 total[name] += change.abs().double().square() / (2 * len(table))
@@ -140,9 +150,11 @@ def spread_of(chain: Chain, trace: Trace, of: Collection[str] | None, pairs: int
     return Spread(found.pop("").to(plain[""].dtype), found)
 
 
-def _errors(chain: Chain, trace: Trace, of: Collection[str] | None) -> tuple[dict[tuple[str, str], _Error], str]:
+def _errors(
+    trace: Trace, uses: Uses, in_doubt: Mapping[str, str], of: Collection[str] | None
+) -> tuple[dict[tuple[str, str], _Error], str]:
     """Errors of values that stages use, by estimate and value, and the first of these stages."""
-    sources = {name: {source.partition(".")[::2] for source in names.values()} for name, names in chain.uses.items()}
+    sources = {name: {source.partition(".")[::2] for source in names.values()} for name, names in uses.items()}
     if isinstance(of, str):
         raise ValueError(f"`of` must be a collection of names of estimates, got the text {of!r}; write [{of!r}]")
     wanted = set(trace.estimates) if of is None else set(of)
@@ -154,7 +166,7 @@ def _errors(chain: Chain, trace: Trace, of: Collection[str] | None) -> tuple[dic
                 f"stage {name!r} both estimates and corrects, and cannot be repeated with another value; estimate and "
                 "correct in two stages, or leave it out: `of` names the estimates whose errors count"
             )
-    applied = {pair for name, pairs in sources.items() if chain.in_doubt[name] == "apply" for pair in pairs}
+    applied = {pair for name, pairs in sources.items() if in_doubt[name] == "apply" for pair in pairs}
     errors = {
         (name, key): _Error(
             trace.estimates[name],
