@@ -194,3 +194,22 @@ def test_lost_pulses_are_named_and_do_not_crop_the_image():
     with pytest.warns(UserWarning, match=r"the largest step between pulses, at pulse 19, is 15.* times the median one"):
         grid = scene_grid(aux["frequency_hz"], some, wide)
     assert grid.azimuth_m == pytest.approx(scene_grid(aux["frequency_hz"], antennas(aux), wide).azimuth_m, rel=0.02)
+
+
+def test_grating_lobes_lie_where_the_warning_says():
+    signal, aux = history_of(rail([-300.0, -20, 100], [-300.0, 20, 100], 41), 316.2, [[0.0, 0, 0]], WIDE_HZ)
+    with pytest.warns(UserWarning, match="grating lobes") as said:
+        stage = SpotlightImage(aux, 40.0, 4.0, 0.2, centre_m=(0.0, 0.0))
+    assert said[0].filename == __file__ and "201 x 21 pixels of 0.2 m" in repr(stage)
+    (limit,) = stage.pulse_limits(antennas(aux), WIDE_HZ)
+    lobe_m = float(limit.consequence.split(" lie ")[1].split(" m ")[0])
+    level = stage(signal).data.abs().amax(-1)
+    away = stage.axes[0].values().abs()
+    lobe = torch.where(away > lobe_m / 2, level, 0)
+    # the range band smears the lobe between its places at the highest and the lowest frequency
+    assert 0.98 * lobe_m < float(away[lobe.argmax()]) < lobe_m * 4.9 / 3.1
+    assert float(lobe.max() / torch.where((away > 3) & (away < lobe_m / 2), level, 0).max()) > 3
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        small = SpotlightImage(aux, 0.98 * lobe_m, 4.0, 0.2, centre_m=(0.0, 0.0))
+    assert small.pulse_limits(antennas(aux), WIDE_HZ)[0].ok

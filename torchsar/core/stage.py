@@ -204,7 +204,8 @@ class Stage(nn.Module):
         return replace(estimate, neutral={key: neutral[key] for key in estimate.value if key in neutral})
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({vars(self).get('_given', '')})"
+        of = self.extra_repr() if "_given" in vars(self) else ""
+        return f"{type(self).__name__}({vars(self).get('_given', '')}){of and f' of {of}'}"
 
     def hold(self, name: str, value: Tensor | float) -> None:
         """Register a value of the stage as its attribute, tunable or constant.

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
 from functools import partial
 from numbers import Real
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -165,10 +163,7 @@ class PathImage(Stage):
         Returns:
             Limits along azimuth and range; or one that refuses the image, if no pulse sees it.
         """
-        grid = self.grid
-        i, j = (torch.linspace(0, n - 1, _POINTS, dtype=torch.float64)[:, None] * grid.step_m for n in grid.counts)
-        points = (grid.origin_m + (i * grid.axes[0])[:, None] + j * grid.axes[1]).reshape(-1, 3)
-        points = points.to(antennas.reference_m.device)
+        grid, points = self.grid, self._nine_points().to(antennas.reference_m.device)
         lit = self.lit(antennas)
         ends = torch.tensor([[0, antennas.pulses]]).expand(len(points), 2) if lit is None else lit(points)
         seen = ends[:, 1] > ends[:, 0]
@@ -210,11 +205,17 @@ class PathImage(Stage):
         power: Callable[[Tensor], Tensor] | None = None,
         beam: ProcessedBeam | None = None,
     ) -> list[Limit]:
-        """Return the limit of the distance of pulses up to which they sample the Doppler band.
+        """Return the limit of the distance of pulses up to which the image is unambiguous.
 
-        Beyond it, a point appears again where its Doppler frequency differs by the PRF. The level
-        of such a ghost is the share of the echo from those pulses whose beam contains both. The
-        range window lowers it, because the range of a ghost changes by a wavelength per pulse.
+        With a beam, pulses must sample its Doppler band. Beyond the limit, a point appears again
+        where its Doppler frequency differs by the PRF. The level of such a ghost is the share of
+        the echo from those pulses whose beam contains both. The range window lowers it, because the
+        range of a ghost changes by a wavelength per pulse.
+
+        Without a beam, the paths over both sides of the image must change by less than a wavelength
+        relative to each other from pulse to pulse: grating lobes of a point lie where they change
+        by a whole one. The limit holds for the range line where the change is largest, and for the
+        median of the pulses, so that lost pulses do not matter.
 
         Args:
             antennas: Path of the antennas; the receiver has the beam.
@@ -224,11 +225,11 @@ class PathImage(Stage):
             beam: Beam of the antenna, which counts where the image has no processed beam.
 
         Returns:
-            The limit; none without a beam.
+            The limit.
         """
         beam = self.beam or beam
         if beam is None:
-            return []
+            return [self._grating_limit(antennas, frequency_hz)]
         track, ways = StraightTrack.fitted(_mean_place(antennas)), 2 if antennas.receiver_m is None else 1
         wavelength = LIGHT_M_S / float(frequency_hz.max())
         longest = wavelength / (ways * beam.band)
@@ -262,6 +263,37 @@ class PathImage(Stage):
                 "only as far as the antenna illuminates no more",
             )
         ]
+
+    def _grating_limit(self, antennas: AntennaPath, frequency_hz: Tensor) -> Limit:
+        """Return the limit of the pulses without a beam, see `pulse_limits`."""
+        places = [place.detach().reshape(-1, antennas.pulses, 3).mean(0) for place in antennas.places]
+        points = self._nine_points().to(places[0].device)
+        path_m = AntennaPath(places[0], places[-1], places[0].new_zeros(antennas.pulses)).path_m(points)
+        steps = path_m.diff(dim=0).unflatten(-1, (_POINTS, _POINTS))
+        turns = (steps.amax(-2) - steps.amin(-2)).amax(-1) * float(frequency_hz.max()) / LIGHT_M_S
+        apart = float(turns[turns > 0].median().nan_to_num(0.0))
+        lobe_m = self.grid.step_m * (self.grid.counts[0] - 1) / max(apart, 1e-12)
+        return Limit(
+            "the change of path from pulse to pulse across the image",
+            apart,
+            1.0,
+            "wavelengths",
+            "warn",
+            f"the pulses do not tell apart places that lie {lobe_m:.3g} m from each other in azimuth, where bright "
+            "points have grating lobes",
+            f"choose an azimuth extent of at most {lobe_m:.3g} m if the beam illuminates no more, or raise the PRF by "
+            f"a factor of {apart:.3g}",
+        )
+
+    def _nine_points(self) -> Tensor:
+        """Corners of the image, middles of its sides, and its middle, in metres, float64 (9, 3)."""
+        grid = self.grid
+        i, j = (torch.linspace(0, n - 1, _POINTS, dtype=torch.float64)[:, None] * grid.step_m for n in grid.counts)
+        return (grid.origin_m + (i * grid.axes[0])[:, None] + j * grid.axes[1]).reshape(-1, 3)
+
+    def extra_repr(self) -> str:
+        """Return the number of pixels and their spacing as words."""
+        return f"{self.grid.counts[0]} x {self.grid.counts[1]} pixels of {self.grid.step_m:.4g} m"
 
     def seen(self, antennas: AntennaPath) -> Tensor:
         """Return the pulses that see a part of the image.
@@ -367,24 +399,6 @@ def seen_in(stages: Iterable[object], antennas: AntennaPath) -> Tensor:
     if image is None:
         return torch.ones(antennas.pulses, dtype=torch.bool, device=antennas.reference_m.device)
     return image.seen(antennas)
-
-
-def possible_plans(plan: Callable[[Any], Any], settings: Iterable[Any]) -> dict[Any, Any]:
-    """Plan the images of a geometry with several settings, such as errors of tiles.
-
-    Args:
-        plan: Function of a setting that returns the plan, or raises ValueError if the geometry does
-            not allow it.
-        settings: Settings.
-
-    Returns:
-        Plans by the settings that the geometry allows.
-    """
-    found: dict[Any, Any] = {}
-    for one in settings:
-        with suppress(ValueError):
-            found[one] = plan(one)
-    return found
 
 
 def last_image(stages: Iterable[object]) -> PathImage | None:

@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -204,7 +205,9 @@ class SpotlightImage(TileImage):
         image = SpotlightImage(recording.aux)(recording.signal)
 
     Extents and spacing that are not given are those of `scene_grid`; if such an image had more than
-    4 million pixels, a UserWarning says how much of the scene is shown.
+    4 million pixels, a UserWarning says how much of the scene is shown. Another warns of grating
+    lobes, if a given azimuth extent is too large for the distance of the pulses, see
+    `PathImage.pulse_limits`.
 
     Args:
         side_data: `frequency_hz`, those of `AntennaPath.side_data`, and optionally
@@ -254,19 +257,28 @@ class SpotlightImage(TileImage):
             warnings.warn(
                 f"the scene of {extents[0]:.0f} x {extents[1]:.0f} m has {pixels:.3g} pixels of {step:.3g} m; the "
                 f"image shows its middle, {shown[0]:.0f} x {shown[1]:.0f} m; give azimuth_m and range_m to see more",
-                stacklevel=2,
+                stacklevel=3,
             )
             extents = shown
         super().__init__(
             extents[0], extents[1], step, grid.centre_m, grid.range_axis_rad, grid.height_m, window, error_db
         )
-        self.side_data, self._own_step = known, step_m is None
+        self.side_data, self._own_step, self._own_extent = known, step_m is None, azimuth_m is None
+        for limit in self.pulse_limits(antennas, known["frequency_hz"]):
+            if not limit.ok:
+                warnings.warn(limit.sentence, stacklevel=3)
 
     def sampling_limits(self, antennas: AntennaPath, frequency_hz: Tensor) -> list[Limit]:
         """Return the limits of a given spacing, see `PathImage`. There are none for the spacing of
         `scene_grid`.
         """
         return [] if self._own_step else super().sampling_limits(antennas, frequency_hz)
+
+    def pulse_limits(self, antennas: AntennaPath, *args: Any, **given: Any) -> list[Limit]:
+        """Return the limit of a given extent, see `PathImage`. There is none for the extent of
+        `scene_grid`, which is unambiguous.
+        """
+        return [] if self._own_extent else super().pulse_limits(antennas, *args, **given)
 
     def forward(
         self,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -17,7 +17,7 @@ from torchsar.core import Chain, Recording, Signal, Trace, per_trial
 from torchsar.echo import Impairment, Simulate
 from torchsar.echo.path import flown_paths, nominal_geometry
 from torchsar.focus import MotionCompensation, OmegaKImage, PathImage, ProcessedBeam, TilePlan, backproject
-from torchsar.focus.path_image import last_image, possible_plans, seen_in
+from torchsar.focus.path_image import last_image, seen_in
 from torchsar.focus.requirements import Limit, Requirement
 from torchsar.focus.spotlight import window_weights
 from torchsar.io import read_history
@@ -443,7 +443,7 @@ class AnyPath(System):
         geometry = (clean.aux["frequency_hz"], antennas.transmitter_m, antennas.receiver_m, antennas.reference_m)
         # the tile plans sum the same pulses as the recommended method
         seen = stage.lit(antennas), stage.weight(antennas)
-        tiles = possible_plans(
+        tiles = _possible_plans(
             lambda error: TilePlan(*geometry, grid, error, *seen, images=None), (-20.0, -40.0, -60.0, -80.0)
         )
         alternatives = [
@@ -459,7 +459,7 @@ class AnyPath(System):
         lit = None if bench.recording is not None else bench.world().beam
         images = (s for c in bench.chains.values() for s in c.stages.values() if isinstance(s, OmegaKImage))
         beams = [image.beam for image in images if image.beam is not None]
-        straight = possible_plans(
+        straight = _possible_plans(
             lambda order: MotionCompensation(geometry[0], antennas, grid, beams[0], order), (1, 2) if beams else ()
         )
         compensated = [
@@ -508,6 +508,17 @@ def _measured(
 
     part = len(some) / len(every)
     return Measured(run, loss, lambda one: part if one.keys["stage"] == "direct_image" else 1.0)
+
+
+def _possible_plans(plan: Callable[[Any], Any], settings: Iterable[Any]) -> dict[Any, Any]:
+    """Plans of images by those settings for which `plan` does not raise ValueError, such as errors
+    of tiles that a geometry allows.
+    """
+    found: dict[Any, Any] = {}
+    for one in settings:
+        with suppress(ValueError):
+            found[one] = plan(one)
+    return found
 
 
 SYSTEM = AnyPath
