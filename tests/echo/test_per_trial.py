@@ -400,8 +400,8 @@ CASES = (
     ),
     Case(
         Speckle,
-        {"count": 7, "azimuth_extent_m": 9.0, "range_extent_m": 40.0},
-        {**RECTANGLE, "level_db": LEVELS},
+        {"count": 7, "azimuth_extent_m": 9.0, "range_extent_m": 40.0, "texture_cells": (2, 3)},
+        {**RECTANGLE, "level_db": LEVELS, "texture_shape": (0.5, 1.5, math.inf)},
         (scene_of_points,),
     ),
     Case(

@@ -1,4 +1,4 @@
-"""Seas: moments of K clutter, texture, images, draws, and errors."""
+"""Seas and textured speckle: moments of K clutter, texture, images, draws, and errors."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchsar.core import Draws
 from torchsar.io.plain import read_array
-from torchsar.scene import ImageReflectivity, KSea
+from torchsar.scene import ImageReflectivity, KSea, Speckle
 from torchsar.scene.sea import gamma_from_normal
 
 
@@ -27,6 +27,22 @@ def test_moments_are_those_of_the_k_distribution(shape):
     assert float(intensity.mean()) == pytest.approx(1, abs=0.01)
     assert float(intensity.square().mean() / intensity.mean() ** 2) == pytest.approx(2 * (1 + 1 / shape), rel=0.03)
     assert abs(complex(s.square().mean())) < 0.01
+
+
+def test_textured_speckle_is_k_distributed_and_shares_its_texture_within_a_cell():
+    shapes = torch.tensor([0.5, 2.0, math.inf])
+    scene = Speckle(40_000, 80.0, 40.0, texture_shape=shapes[:, None], texture_cells=(40, 20))
+    drawn = scene.scatterers(Draws(1, trials=range(4)))
+    intensity = drawn.amplitude.abs().square()
+    assert intensity.shape == (3, 4, 40_000)
+    moment = (intensity.square().mean(-1) / intensity.mean(-1) ** 2).mean(-1)
+    torch.testing.assert_close(moment, 2 * (1 + 1 / shapes.double()), rtol=0.1, atol=0)
+    cell = (drawn.azimuth_m / 2.0).floor() * 100 + (drawn.range_m / 2.0).floor()
+    level = torch.stack([intensity[0, 0][cell[0] == at].mean() for at in cell[0].unique()])
+    # mean of 50 scatterers of a cell: the variance of the gamma texture, 2, and 1 / 50 of 2 + 1
+    assert float(level.var() / level.mean() ** 2) == pytest.approx(2.0 + 3 / 50, rel=0.3)
+    alone = Speckle(40_000, 80.0, 40.0, texture_shape=0.5, texture_cells=(40, 20)).scatterers(Draws(1, trials=[2]))
+    assert torch.equal(alone.amplitude[0], drawn.amplitude[0, 2]) and torch.equal(alone.range_m[0], drawn.range_m[2])
 
 
 @pytest.mark.parametrize("shape", [0.1, 0.5, 1.0, 1.5, 30.0, 1000.0])
@@ -156,6 +172,13 @@ def test_images_come_from_files(tmp_path):
 def test_impossible_seas_are_refused(changes, sentence):
     with pytest.raises(ValueError, match=sentence):
         KSea(**changes)
+
+
+def test_impossible_textures_are_refused():
+    with pytest.raises(ValueError, match=r"texture_shape of speckle must lie in 0.1..1000, or be inf .* got 0.05"):
+        Speckle(10, 1.0, 1.0, texture_shape=0.05)
+    with pytest.raises(ValueError, match=r"two whole numbers of 1 or more, along azimuth and range, got \(0, 3\)"):
+        Speckle(10, 1.0, 1.0, texture_cells=(0, 3))
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -170,11 +171,7 @@ class KSea(Sea):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        refuse_unless(
-            "shape of a K sea must lie in 0.1..1000, or be inf for pure speckle",
-            self.shape,
-            lambda x: _is_shape(x) | (x == math.inf),
-        )
+        refuse_other_shape("shape of a K sea", self.shape)
         if len(self.cell_m) != 2 or not all(math.isfinite(side) and side > 0 for side in self.cell_m):
             raise ValueError(
                 f"cell_m of a K sea must be two positive sides (m), along track and in range, got {self.cell_m}"
@@ -184,11 +181,8 @@ class KSea(Sea):
         row, column = (
             _cells(positions, side) for positions, side in zip((azimuth_m, range_m), self.cell_m, strict=True)
         )
-        shape = (int(row.max()) + 1, int(column.max()) + 1)
-        if not isinstance(self.shape, Tensor) and self.shape == math.inf:
-            return torch.ones(shape, dtype=torch.float64, device=row.device), row, column
-        normal = draws.normal("sea.texture", shape, device=row.device)
-        return gamma_from_normal(normal, with_dims(self.shape, 2, row)), row, column
+        counts = (int(row.max()) + 1, int(column.max()) + 1)
+        return gamma_texture(self.shape, counts, draws, "sea.texture", row.device), row, column
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,6 +252,42 @@ class ImageReflectivity(Sea):
         extents = zip((azimuth_m, range_m), (self.azimuth_extent_m, self.range_extent_m), image.shape[-2:])
         row, column = (_mirrored(at / with_dims(extent, 1, at), n) for at, extent, n in extents)
         return image / image.mean((-2, -1), keepdim=True), row, column
+
+
+def refuse_other_shape(name: str, shape: Tensor | float) -> None:
+    """Refuse what is no shape of a texture.
+
+    Args:
+        name: Name of the shape.
+        shape: Shape of the gamma distribution, inf for pure speckle.
+
+    Raises:
+        ValueError: If a shape is out of range.
+    """
+    sentence = f"{name} must lie in 0.1..1000, or be inf for pure speckle"
+    refuse_unless(sentence, shape, lambda x: _is_shape(x) | (x == math.inf))
+
+
+def gamma_texture(
+    shape: Tensor | float, counts: Sequence[int], draws: Draws, purpose: str, device: torch.device | None = None
+) -> Tensor:
+    """Draw the mean intensities of the cells of a texture.
+
+    Args:
+        shape: Shape of the gamma distribution, a number or (...,); with the number inf nothing is
+            drawn.
+        counts: Numbers of cells along azimuth and range.
+        draws: Random draws.
+        purpose: Purpose of the draws.
+        device: Device of the result.
+
+    Returns:
+        Intensities of unit mean, shape (..., azimuth, range), float64.
+    """
+    if not isinstance(shape, Tensor) and shape == math.inf:
+        return torch.ones(tuple(counts), dtype=torch.float64, device=device)
+    normal = draws.normal(purpose, tuple(counts), device=device)
+    return gamma_from_normal(normal, with_dims(shape, 2, normal))
 
 
 def gamma_from_normal(x: Tensor, shape: Tensor | float) -> Tensor:

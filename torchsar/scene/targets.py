@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws
+from torchsar.scene.sea import gamma_texture, refuse_other_shape
 from torchsar.scene.trials import (
     either,
     finite,
@@ -313,9 +314,12 @@ class _Rectangle(Scene):
         for name in ("azimuth_m", "range_m"):
             refuse_unless_finite(f"{name} of random scatterers", getattr(self, name))
 
-    def _places(self, draws: Draws, purpose: str) -> tuple[Tensor, Tensor]:
-        """Draw azimuth and range of the scatterers, (..., target) each."""
-        shares = [draws.uniform(f"{purpose}.{name}", (self.count,)) for name in ("azimuth", "range")]
+    def _shares(self, draws: Draws, purpose: str) -> list[Tensor]:
+        """Draw azimuth and range of the scatterers as shares of the sides, (..., target) each."""
+        return [draws.uniform(f"{purpose}.{name}", (self.count,)) for name in ("azimuth", "range")]
+
+    def _places(self, shares: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+        """Azimuth and range in metres at shares of the sides, (..., target) each."""
         middles, extents = (self.azimuth_m, self.range_m), (self.azimuth_extent_m, self.range_extent_m)
         x, r = (
             with_dims(middle, 1, share) + with_dims(extent, 1, share) * (share - 0.5)
@@ -355,7 +359,7 @@ class RandomPoints(_Rectangle):
         level = 10 ** (-with_dims(self.spread_db, 1, share) * share / 20)
         phase = 2 * math.pi * draws.uniform("scene.random.phase", (self.count,))
         amplitude = torch.polar(*torch.broadcast_tensors(level, phase))
-        return Scatterers(*self._places(draws, "scene.random"), amplitude)
+        return Scatterers(*self._places(self._shares(draws, "scene.random")), amplitude)
 
 
 @dataclass(frozen=True)
@@ -368,6 +372,14 @@ class Speckle(_Rectangle):
     100.0
 
     About three scatterers or more per resolution cell are needed for the statistics of clutter.
+    With a texture they form compound (K-distributed) clutter: the intensity I of a scatterer
+    satisfies <I^2> / <I>^2 = 2 (1 + 1 / texture_shape), and so does that of an image whose
+    resolution cells are smaller than those of the texture:
+
+    >>> spiky = scene.Speckle(200_000, 100.0, 100.0, texture_shape=2.0, texture_cells=(100, 100))
+    >>> intensity = spiky.scatterers(Draws(seed=1)).amplitude.abs().square()
+    >>> round(float(intensity.square().mean() / intensity.mean().square()), 1)
+    3.0
 
     Args:
         count: Number of scatterers, fixed for all trials.
@@ -376,22 +388,44 @@ class Speckle(_Rectangle):
         azimuth_m: Azimuth of its middle in metres.
         range_m: Range of its middle in metres.
         level_db: Mean power of all scatterers together in decibels relative to a scatterer of
-            amplitude 1, within +-300 dB.
+            amplitude 1, within +-300 dB. With a texture it is the mean over random draws.
+        texture_shape: Shape of the gamma distribution of the local mean power, 0.1 to 1000, small
+            for spiky clutter; inf for pure speckle.
+        texture_cells: Numbers of cells of one local mean power along the azimuth side and the range
+            side of the rectangle, fixed for all trials.
 
     Raises:
-        ValueError: If there is no scatterer, an extent is negative or a number is out of range.
+        ValueError: If there is no scatterer or cell, an extent is negative or a number is out of
+            range.
+
+    Reference:
+        Ward, Tough and Watts, Sea Clutter, IET 2013 (compound model).
     """
 
     level_db: Tensor | float = 0.0
+    texture_shape: Tensor | float = math.inf
+    texture_cells: tuple[int, int] = (10, 10)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         refuse_unless("level_db must lie within +-300 dB", self.level_db, lambda x: abs(x) <= 300)
+        refuse_other_shape("texture_shape of speckle", self.texture_shape)
+        if len(self.texture_cells) != 2 or not all(isinstance(n, int) and n >= 1 for n in self.texture_cells):
+            raise ValueError(
+                "texture_cells of speckle must be two whole numbers of 1 or more, along azimuth and range, got "
+                f"{self.texture_cells}"
+            )
 
     def scatterers(self, draws: Draws) -> Scatterers:
         unit = draws.normal("scene.speckle.amplitude", (self.count,), torch.complex128)
         scale = 10 ** (with_dims(self.level_db, 1, unit) / 20) / math.sqrt(self.count)
-        return Scatterers(*self._places(draws, "scene.speckle"), scale * unit)
+        shares = self._shares(draws, "scene.speckle")
+        texture = gamma_texture(self.texture_shape, self.texture_cells, draws, "scene.speckle.texture", unit.device)
+        row, column = ((share * n).long().clamp(max=n - 1) for share, n in zip(shares, self.texture_cells, strict=True))
+        trials = np.broadcast_shapes(texture.shape[:-2], row.shape[:-1])
+        cell = (row * self.texture_cells[1] + column).expand(*trials, -1)
+        local = texture.flatten(-2).expand(*trials, -1).gather(-1, cell)
+        return Scatterers(*self._places(shares), scale * unit * local.sqrt())
 
 
 @dataclass(frozen=True)
