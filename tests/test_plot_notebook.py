@@ -54,6 +54,12 @@ def test_the_label_of_the_colours_fits_a_flat_image() -> None:
         assert "percentile 99.9" in label.get_text() and box.y0 >= 0 and box.y1 <= figure.bbox.height
 
 
+def test_doppler_frequencies_are_those_of_baseband() -> None:
+    axes = Axis("doppler", 24, -12.0, 1.0, "Hz"), Axis("range_frequency", 32, 0.0, 1.0, "1/m")
+    drawn = plot.image(Signal(torch.rand(24, 32), axes)).axes[0]
+    assert (drawn.get_ylabel(), drawn.get_xlabel()) == ("baseband Doppler (Hz)", "range frequency (1/m)")
+
+
 def test_curves_have_limits_of_both_axes() -> None:
     axes = plot.curves({"a": (np.arange(9.0), np.arange(9.0))}, "x", "y", ylim=(1, 2), xlim=(3, 4)).axes[0]
     assert axes.get_xlim() == (3, 4) and axes.get_ylim() == (1, 2)

@@ -148,8 +148,9 @@ class DopplerTransform(Stage):
     >>> focus.DopplerTransform()(lines).axes[0].values()
     tensor([-200., -100.,    0.,  100.], dtype=torch.float64)
 
-    The Doppler axis is that within one PRF about zero. Step 1 is `RangeCompress`, step 3
-    `CorrectRangeMigration`, and step 4 `AzimuthCompress`.
+    The Doppler axis is that of baseband, within one PRF about zero: the absolute frequency differs
+    from it by whole PRFs, and lies within half of one of the Doppler centroid. Step 1 is
+    `RangeCompress`, step 3 `CorrectRangeMigration`, and step 4 `AzimuthCompress`.
     """
 
     def forward(self, signal: Signal) -> Signal:

@@ -143,6 +143,14 @@ def boxes(centres: Sequence[tuple[float, float]], half_x: float, half_y: float) 
     return (at[:, :1] + x).ravel(), (at[:, 1:] + y).ravel()
 
 
+def _label(axis: Axis, more: str = "") -> str:
+    """Label of an axis of a picture. The Doppler frequency of sampled pulses is known within one
+    PRF only, which is called baseband.
+    """
+    name = "baseband Doppler" if axis.name == "doppler" else axis.name.replace("_", " ")
+    return f"{name}{more} ({axis.unit})"
+
+
 def _extent(signal: Signal, origin: Sequence[float]) -> tuple[float, float, float, float]:
     """Edges of an image as `imshow` needs them, relative to an origin of the axes."""
     vertical, horizontal = signal.axes
@@ -202,8 +210,8 @@ def _show(signal: Signal, width: float, dynamic_range_db: float, title: str, top
     )
     beyond = f" beyond {origin[1]:,.0f} m" if origin[1] else ""
     axes.set(
-        xlabel=f"{signal.axes[1].name}{beyond} ({signal.axes[1].unit})",
-        ylabel=f"{signal.axes[0].name} ({signal.axes[0].unit})",
+        xlabel=_label(signal.axes[1], beyond),
+        ylabel=_label(signal.axes[0]),
         title=wrapped_title(title, width),
     )
     axes.grid(False)
@@ -300,7 +308,7 @@ def response(signal: Signal, at_m: tuple[float, float], floor_db: float = -50.0)
             f"-3 dB width {2 * half:.3g} {axis.unit}": mark,
         }
         title = f"{axis.name}: PSLR {float(measured[f'pslr_{axis.name}_db']):.1f} dB"
-        xlabel = f"{axis.name} from the peak ({axis.unit})"
+        xlabel = _label(axis, " from the peak")
         figures.append(curves_of(PANEL, series, xlabel, "level (dB)", title, ylim=(floor_db, 1.0)))
     return figures
 
@@ -330,8 +338,8 @@ def contours(signals: Mapping[str, Signal], levels_db: Sequence[float] = (-30, -
             linewidths=1.0,
         )
         axes.set(
-            xlabel=f"{horizontal.name} ({horizontal.unit})",
-            ylabel=f"{vertical.name} ({vertical.unit})",
+            xlabel=_label(horizontal),
+            ylabel=_label(vertical),
             title=wrapped_title(title, width),
             aspect="auto" if ratio is None else "equal",
         )

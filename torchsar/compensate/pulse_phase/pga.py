@@ -66,7 +66,8 @@ def pga(
     and estimates the remaining phase with the kernel. A constant and a linear part of this phase
     are dropped. Once the window no longer narrows, a trial ends after `patience` iterations that do
     not lower the image entropy. The result is the phase of the iteration with the least entropy,
-    because iterations with narrow windows drift away. Differentiable, except for the choice of the
+    because iterations with narrow windows drift away; a loop over the largest number of
+    `iterations` thus shows the course of the search. Differentiable, except for the choice of the
     peaks and of that iteration.
 
     From a zero start PGA fails on phase errors that are large or independent from pulse to pulse;
