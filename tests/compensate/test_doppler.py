@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
+from tests.repair import test_placing as placing
 from torchsar.compensate import (
     DopplerCentroid,
     EffectiveVelocity,
@@ -95,6 +97,20 @@ def test_missing_lines_do_not_bias() -> None:
     holed[torch.randperm(2048, generator=torch.Generator().manual_seed(0))[:100]] = 0
     for estimator in (phase_increment, energy_centre):
         assert abs(float(estimator(holed, PRF)["doppler_baseband_hz"]) - 120) < 1.0
+
+
+@pytest.mark.parametrize(("dwell", "most"), [(None, 0.7), (0.8, 0.4)])  # 1.6 and 2.3 Hz if gaps count for nothing
+def test_a_gap_takes_parts_of_dwells_without_much_bias(dwell: float | None, most: float) -> None:
+    raw = torch.from_numpy(placing.echoes(np.arange(placing.LINES) / placing.PRF, 0.0)).to(torch.complex64)
+    raw = raw + 0.05 * torch.randn(raw.shape, generator=torch.Generator().manual_seed(0), dtype=raw.dtype)
+    find, found = DopplerCentroid(replace(placing.sensor(placing.PRF, 0.0), integration_s=dwell)), []
+    for first in (placing.LINES, 80, 180, 250, 330, 410):
+        holed = raw.clone()
+        holed[first : first + 60] = 0
+        found.append(find(Signal(holed, find.radar.raw_axes(*raw.shape))))
+    errors = torch.stack([one["doppler_hz"] - found[0]["doppler_hz"] for one in found[1:]])
+    assert float(errors.square().mean().sqrt()) < most
+    assert bool((errors.abs() < 2 * torch.stack([one.std["doppler_hz"] for one in found[1:]])).all())
 
 
 def test_predicted_std_covers_the_scatter_over_seeds() -> None:

@@ -90,11 +90,18 @@ def _refined(
     products = products * weight
     tile = raw.shape[-2] / products.shape[-2]
     line = (torch.arange(products.shape[-2], dtype=torch.float64, device=raw.device) + 0.5) * tile
+    uncut, held = products, (raw.detach() != 0).any(-1).long()
+    # zeros before the first and after the last of the other lines are none that a gap has taken
+    held = (held | (held.cumsum(-1) == 0).long() | (held.flip(-1).cumsum(-1) == 0).flip(-1).long()).double()
     total, whole, phase = doppler_hz, torch.ones_like(power), torch.zeros_like(doppler_hz)
     for _ in range(8):
         # an error d of the assumed Doppler frequency delays the targets by d / rate
         shift = (total - doppler_hz)[..., None, None] / rate * radar.prf_hz
-        whole = _whole(line[:, None] - shift, raw.shape[-2], dwell)
+        crossing = line[:, None] - shift
+        whole = _whole(crossing, raw.shape[-2], dwell)
+        # the lines that a gap leaves of a dwell have another mean Doppler
+        late = 2 * math.pi * rate / radar.prf_hz**2 * _mean_offset(held, crossing, dwell)
+        products = uncut * cis(late)
         chosen = (products * whole).sum((-2, -1))
         phase = torch.angle(chosen)
         total = torch.where(chosen.abs() > 0, total + wrapped(scale * phase - total, radar.prf_hz), total)
@@ -118,6 +125,25 @@ def _whole(crossing: Tensor, lines: int, dwell: int) -> Tensor:
     """
     margin = torch.minimum(crossing - dwell / 2, lines - dwell / 2 - crossing)
     return (margin / min(0.1 * dwell, (lines - dwell) / 4)).clamp(0, 1)
+
+
+def _mean_offset(held: Tensor, crossing: Tensor, dwell: int) -> Tensor:
+    """Mean distance in lines of the lines of a dwell that are there from its middle.
+
+    held: 1 for a line that is there, 0 for a missing one, (..., line). crossing: middles, (..., a,
+    b).
+    """
+    n = held.shape[-1]
+    first = (crossing - dwell / 2).round().long().clamp(0, n)
+    last = (first + dwell).clamp(max=n)
+    index = torch.arange(n, dtype=held.dtype, device=held.device)
+
+    def between(x: Tensor) -> Tensor:
+        sums = torch.nn.functional.pad(x.cumsum(-1), (1, 0))
+        high, low = (sums.gather(-1, at.flatten(-2)).view(at.shape) for at in (last, first))
+        return high - low
+
+    return between(held * index) / between(held).clamp_min(1) - (first + last - 1) / 2
 
 
 def _tiles(

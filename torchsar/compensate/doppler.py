@@ -3,10 +3,10 @@
 Neither estimator needs the velocity (Tsvetkov 2017, Doppler estimation). Both take the phase of the
 first Fourier coefficient of the azimuth power spectrum. The mean phase increment computes this
 coefficient in time, from products of adjacent lines; the energy centre computes it in frequency.
-The results agree to rounding and are therefore not independent evidence.
+The results agree to rounding where no line is missing, and are therefore not independent evidence.
 
-Doppler is positive when closing. Lines that are all zero (missing) enter no product and bias
-neither estimator.
+Doppler is positive when closing. Lines that are all zero (missing) enter no product. Where many
+lines in a row are missing, the mean phase increment gives their place to the pairs beside them.
 """
 
 from __future__ import annotations
@@ -41,6 +41,31 @@ def _bounds(n: int, parts: int, what: str) -> list[tuple[int, int]]:
     return list(pairwise(edges))
 
 
+def _pair_weights(held: Tensor) -> Tensor:
+    """Weights of pairs of lines, 0 where one of the lines is missing.
+
+    A gap cuts the dwells of targets, and the lines that are left of them have another mean Doppler.
+    The pairs before and after a gap, as many as it has on each side, therefore count for those in
+    it by a half each. The middle of these is that of the gap.
+
+    Args:
+        held: Whether both lines of a pair are there, shape (..., pair), bool.
+
+    Returns:
+        The weights, of the same shape, from 0 to 2.
+    """
+
+    def beside(held: Tensor) -> Tensor:
+        """Pairs that follow a gap by no more than its length."""
+        index = torch.arange(held.shape[-1], device=held.device)
+        last = torch.where(held, -1, index).cummax(-1).values  # of the gap before a pair
+        before = torch.where(held, index, -1).cummax(-1).values.gather(-1, last.clamp_min(0))
+        # a gap at the end of the record has no pairs on its other side
+        return held & (last >= 0) & (before >= 0) & (index - last <= last - before)
+
+    return held.double() + 0.5 * beside(held) + 0.5 * beside(held.flip(-1)).flip(-1)
+
+
 def lag_products(x: Tensor, blocks: tuple[int, int] = (8, 8)) -> tuple[Tensor, Tensor]:
     """Sum the products of adjacent lines, and the powers of these lines, over blocks of the data.
 
@@ -54,7 +79,8 @@ def lag_products(x: Tensor, blocks: tuple[int, int] = (8, 8)) -> tuple[Tensor, T
 
     Returns:
         The sum of the products of each block, shape (..., a, b), complex128; and the sum of the
-        mean power of the two lines of each pair, shape (..., a, b), float64. The modulus of a
+        mean power of the two lines of each pair, shape (..., a, b), float64. Pairs beside a gap
+        count for those that the gap has taken. The modulus of a
         product never exceeds its power; their ratio is the coherence.
 
     Raises:
@@ -65,14 +91,14 @@ def lag_products(x: Tensor, blocks: tuple[int, int] = (8, 8)) -> tuple[Tensor, T
     x = unit_level(checked_samples(x, "lag_products", "pulse, range", finite=False))
     columns = [last - first for first, last in _bounds(x.shape[-1], blocks[1], "range samples")]
     products, powers, peaks = [], [], []
+    held = (x.detach() != 0).any(-1)
+    weights = _pair_weights(held[..., :-1] & held[..., 1:]).to(x.real.dtype)[..., None]
     for first, last in _bounds(x.shape[-2] - 1, blocks[0], "pairs of lines"):
-        part = x[..., first : last + 1, :]
+        part, weight = x[..., first : last + 1, :], weights[..., first:last, :]
         square = power_of(part)
-        brightest = square.detach().amax(-1)
-        peaks.append(brightest.amax(-1))
-        both = ((brightest[..., :-1] > 0) & (brightest[..., 1:] > 0)).to(square.dtype)[..., None]
-        product = (part[..., :-1, :].conj() * part[..., 1:, :]).sum(-2)
-        power = 0.5 * ((square[..., :-1, :] + square[..., 1:, :]) * both).sum(-2)
+        peaks.append(square.detach().amax((-2, -1)))
+        product = (part[..., :-1, :].conj() * part[..., 1:, :] * weight).sum(-2)
+        power = 0.5 * ((square[..., :-1, :] + square[..., 1:, :]) * weight).sum(-2)
         for sums, each in ((products, product.to(torch.complex128)), (powers, power.to(torch.float64))):
             sums.append(torch.stack([some.sum(-1) for some in each.split(columns, -1)], -1))
     # the products of zeros are zero whatever they are divided by
