@@ -336,6 +336,7 @@ MISTAKES: dict[str, tuple[dict[str, Any], list[str]]] = {
     "a name": ({"samples.name": "iq/dat"}, ["has no array 'iq/dat'", "did you mean 'iq/data'"]),
     "no name": ({"samples.name": None}, ["holds the arrays iq/data, ", "give the name of one of them"]),
     "a layout": ({"samples.dtype": "int8"}, ["samples.dtype", "is a numpy file; give name instead"]),
+    "a name of Python": ({"radar.carrier_hz": 1e9}, ["radar: key 'carrier_hz' is not known", "did you mean 'f0_hz'"]),
     "a radar key": ({"radar.prf": 3.0}, ["radar: key 'prf' is not known", "did you mean 'prf_hz'"]),
     "another unit": ({"radar.prf_hz": "3 m"}, ["radar.prf_hz has the unit 'm', and Hz is expected", "kHz"]),
     "a misspelt unit": ({"radar.prf_hz": "3 Mhz"}, ["radar.prf_hz has the unit 'Mhz'", "did you mean 'MHz'"]),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -146,6 +147,18 @@ def test_headers_of_instruments(tmp_path: Path, header: str) -> None:
 def test_milliseconds_in_a_word(tmp_path: Path) -> None:
     (tmp_path / "log.csv").write_text("time(millisecond),x,y,z\n0,1,2,3\n500,1,2,3\n")
     assert read_track(tmp_path / "log.csv").time_s.tolist() == [0.0, 0.5]
+
+
+def test_doubtful_degrees_without_names_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "boat.txt"
+    time = np.arange(100.0)
+    np.savetxt(path, np.stack([time, 48 + 1e-4 * time, 11 + 0 * time, 0.5 + 0 * time], -1), fmt="%.8f")
+    with pytest.warns(UserWarning, match=r"is read as time, x, y, z in metres, which move by 0.0099 m in 99 s; if"):
+        assert read_track(path).frame is None
+    np.savetxt(path, np.stack([time, 0.1 * time, 0 * time, 2 + 0 * time], -1))  # a rail
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read_track(path)
 
 
 def test_degrees_without_names_are_no_metres(tmp_path: Path) -> None:

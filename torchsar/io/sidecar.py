@@ -99,6 +99,11 @@ _UNITS = {
     "deg": {"deg": 1.0, "rad": 180 / math.pi},
     "dB": {"dB": 1.0},
 }
+# keys of sidecars for the names that the same numbers have in Python
+_PYTHON_NAMES = {
+    **{"carrier_hz": "f0_hz", "sampling_hz": "fs_hz", "velocity_m_s": "v_eff_m_s"},
+    **{"near_range_m": "slant_range_cell1_m", "frequency_hz": "freq_hz", "reference_m": "path_reference_m"},
+}
 _WITH_UNIT = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?) *([A-Za-z/]+)")
 _DTYPES = (
     *("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "float16", "float32", "float64"),
@@ -407,7 +412,7 @@ def _section(tree: Any, where: str, accepted: _Keys, needed: Sequence[str] = ())
         raise ValueError(f"{where} must be a mapping with some of the keys {', '.join(accepted)}, got {got}")
     for key, value in tree.items():
         if key not in accepted:
-            raise ValueError(f"{where}: key {key!r} is not known{did_you_mean(str(key), accepted)}")
+            raise ValueError(f"{where}: key {key!r} is not known{did_you_mean(_PYTHON_NAMES.get(str(key), str(key)), accepted)}")
         kind, words = accepted[key]
         if (
             words

@@ -74,7 +74,7 @@ def read_track(file: str | Path, origin: Sequence[float] | None = None) -> Track
     Common other names such as `t`, `east`, `lat`, `alt` are known, and units behind them, as in
     `time_ms`, `x (km)` or `time(milliseconds)`. A table of four numbers without names has the
     columns time, x, y, z; it is refused where x and y might be degrees, and change by less than a
-    hundredth of z. Other columns are ignored. Records with NaN are left out, and a warning names
+    hundredth of z, and a warning names the doubt where they change by less than 2 cm/s. Other columns are ignored. Records with NaN are left out, and a warning names
     them.
 
     Args:
@@ -125,6 +125,14 @@ def read_track(file: str | Path, origin: Sequence[float] | None = None) -> Track
             raise ValueError(
                 f"{path} has no line of names, and columns 2 and 3 ({place[0, 0]:g}, {place[0, 1]:g}) hardly change, "
                 "as degrees do; write time,lat,lon,height or time,x,y,z into its first line"
+            )
+        # slower than any platform but a rail, and a degree is 111 km
+        if unnamed and size[0] <= 90 and size[1] <= 360 and float(reach.max()) < 0.02 * float(time_s[-1] - time_s[0]):
+            warnings.warn(
+                f"{path} has no line of names and is read as time, x, y, z in metres, which move by "
+                f"{float(reach.max()):.3g} m in {float(time_s[-1] - time_s[0]):.4g} s; if columns 2 and 3 are degrees, "
+                "write time,lat,lon,height into its first line, else time,x,y,z",
+                stacklevel=2,
             )
         return Track(time_s, place if origin is None else place - place.new_tensor(list(origin)))
     if float(place[:, 0].abs().max()) > 90 or float(place[:, 1].abs().max()) > 360:
