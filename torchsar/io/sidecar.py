@@ -412,7 +412,8 @@ def _section(tree: Any, where: str, accepted: _Keys, needed: Sequence[str] = ())
         raise ValueError(f"{where} must be a mapping with some of the keys {', '.join(accepted)}, got {got}")
     for key, value in tree.items():
         if key not in accepted:
-            raise ValueError(f"{where}: key {key!r} is not known{did_you_mean(_PYTHON_NAMES.get(str(key), str(key)), accepted)}")
+            hint = did_you_mean(_PYTHON_NAMES.get(key, str(key)), accepted)
+            raise ValueError(f"{where}: key {key!r} is not known{hint}")
         kind, words = accepted[key]
         if (
             words

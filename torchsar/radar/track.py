@@ -74,7 +74,8 @@ def read_track(file: str | Path, origin: Sequence[float] | None = None) -> Track
     Common other names such as `t`, `east`, `lat`, `alt` are known, and units behind them, as in
     `time_ms`, `x (km)` or `time(milliseconds)`. A table of four numbers without names has the
     columns time, x, y, z; it is refused where x and y might be degrees, and change by less than a
-    hundredth of z, and a warning names the doubt where they change by less than 2 cm/s. Other columns are ignored. Records with NaN are left out, and a warning names
+    hundredth of z, and a warning names the doubt where they change by less than 2 cm/s. Other
+    columns are ignored. Records with NaN are left out, and a warning names
     them.
 
     Args:
