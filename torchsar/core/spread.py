@@ -178,10 +178,11 @@ def _errors(
         if name in wanted and key in trace.estimates[name].std
     }
     if not errors:
+        used = sorted(".".join(pair) for pairs in sources.values() for pair in pairs if pair[0] in wanted)
+        known = {name: sorted(trace.estimates[name].std) for name in sorted(wanted)}
         raise ValueError(
-            f"no stage uses a value with a standard deviation of the estimates {sorted(wanted)}; they have "
-            f"{ {name: sorted(trace.estimates[name].std) for name in sorted(wanted)} }; an estimator with "
-            "assess=True has them"
+            f"no value that stages use has a standard deviation: they use {used or 'no estimate'}, and the estimates "
+            f"have those of {known}; an estimator with assess=True gives the ones that it can tell"
         )
     return errors, next(name for name, used in sources.items() if used & set(errors))
 

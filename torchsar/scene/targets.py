@@ -390,7 +390,7 @@ class Speckle(_Rectangle):
         level_db: Mean power of all scatterers together in decibels relative to a scatterer of
             amplitude 1, within +-300 dB. With a texture it is the mean over random draws.
         texture_shape: Shape of the gamma distribution of the local mean power, 0.1 to 1000, small
-            for spiky clutter; inf for pure speckle.
+            for spiky clutter; None or inf for pure speckle.
         texture_cells: Numbers of cells of one local mean power along the azimuth side and the range
             side of the rectangle, fixed for all trials.
 
@@ -403,13 +403,13 @@ class Speckle(_Rectangle):
     """
 
     level_db: Tensor | float = 0.0
-    texture_shape: Tensor | float = math.inf
+    texture_shape: Tensor | float | None = None
     texture_cells: tuple[int, int] = (10, 10)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         refuse_unless("level_db must lie within +-300 dB", self.level_db, lambda x: abs(x) <= 300)
-        refuse_other_shape("texture_shape of speckle", self.texture_shape)
+        refuse_other_shape("texture_shape of speckle", math.inf if self.texture_shape is None else self.texture_shape)
         if len(self.texture_cells) != 2 or not all(isinstance(n, int) and n >= 1 for n in self.texture_cells):
             raise ValueError(
                 "texture_cells of speckle must be two whole numbers of 1 or more, along azimuth and range, got "
@@ -420,6 +420,8 @@ class Speckle(_Rectangle):
         unit = draws.normal("scene.speckle.amplitude", (self.count,), torch.complex128)
         scale = 10 ** (with_dims(self.level_db, 1, unit) / 20) / math.sqrt(self.count)
         shares = self._shares(draws, "scene.speckle")
+        if self.texture_shape is None:
+            return Scatterers(*self._places(shares), scale * unit)
         texture = gamma_texture(self.texture_shape, self.texture_cells, draws, "scene.speckle.texture", unit.device)
         row, column = ((share * n).long().clamp(max=n - 1) for share, n in zip(shares, self.texture_cells, strict=True))
         trials = np.broadcast_shapes(texture.shape[:-2], row.shape[:-1])

@@ -102,9 +102,11 @@ def path_autofocus(
         positions in metres, recorded minus true, of both antennas alike, for `CorrectPath`. `info`
         holds "roughness" (see `roughness`: about 1 if the fringes come from single envelopes, less
         for smooth motions) and "entropy_nats" of the image, shape (...,).
-        The assessment adds the standard deviation of `line_of_sight_m` modulo half a wavelength; it
-        follows from what the estimated scene and motion leave of the samples, and from the
-        difference from the result of another start, weighed by how well that explains the samples.
+        The assessment adds the standard deviation of `line_of_sight_m` modulo half a wavelength;
+        `offset_m` has none, since its parts across the line of sight are hardly determined. The
+        standard deviation follows from what the estimated scene and motion leave of the samples,
+        and from the difference from the result of another start, weighed by how well that explains
+        the samples.
         `quality` is the Strehl ratio predicted from it with half of the power of that difference,
         however well the other explains the samples, times the share of the sharpness that noise
         does not explain. Sharpness is the amount by which the image entropy lies below that of

@@ -177,7 +177,10 @@ class Config(Strict):
     @model_validator(mode="after")
     def _whole(self) -> Config:
         if "recommended" not in self.processor:
-            raise ValueError("processor needs a method called 'recommended'")
+            raise ValueError(
+                "one method of the processor must be called 'recommended': `requires`, `trade` and the reports go by "
+                f"it; rename one of {', '.join(self.processor)}, whose `title` stays what readers see"
+            )
         if self.processor["recommended"].stages is None:
             raise ValueError("processor.recommended needs stages of its own")
         for name in self.processor:
