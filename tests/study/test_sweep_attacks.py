@@ -319,10 +319,10 @@ def test_an_algorithm_without_the_metric_neither_succeeds_nor_fails() -> None:
 def test_workers_that_do_not_start_are_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     distributed = pytest.importorskip("distributed")
 
-    def fail(**_: Any) -> None:
+    def fail(*_: Any, **__: Any) -> None:
         raise RuntimeError("Nanny failed to start.")
 
-    monkeypatch.setattr(distributed, "LocalCluster", fail)
+    monkeypatch.setattr(distributed, "SpecCluster", fail)
     with pytest.raises(ConfigError, match="did not start .*__main__"), engine(2):
         pass
 

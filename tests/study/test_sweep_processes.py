@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import os
 import random
+import re
+import shutil
 import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +23,12 @@ from tests.program import Program, fork_workers
 from tests.study import toy
 from tests.study.tiny import write_tiny
 from torchsar.cli import main
+from torchsar.core import Draws
 from torchsar.study.montecarlo import Record, engines, read_sweep
 from torchsar.study.montecarlo.engines import engine
 from torchsar.study.montecarlo.fingerprint import code
+from torchsar.study.montecarlo.grid import make_grid
+from torchsar.study.montecarlo.work import Chunk, Work
 from torchsar.study.output import progress
 from torchsar.study.settings.errors import ConfigError
 
@@ -126,8 +134,6 @@ def test_a_program_killed_at_random_moments_loses_nothing_and_repeats_nothing(al
 
 def addresses(done: np.ndarray) -> set[tuple[str, str]]:
     """Rows that are marked, as the log names them."""
-    from torchsar.study.montecarlo.grid import make_grid
-
     points = make_grid(toy.GRID, ["snr_db"]).points()
     return {(p.address, str(trial)) for p in points for trial in np.flatnonzero(done[p.index])}
 
@@ -280,17 +286,89 @@ def test_workers_are_awaited_and_the_loss_of_a_scheduler_is_one_sentence(
             toy.run(cluster=cluster.scheduler_address, chunk=7)
 
 
+def answer(port: int) -> bytes:
+    """What a port of this machine answers to a web browser."""
+    try:
+        with socket.create_connection(("127.0.0.1", port), timeout=5) as ours:
+            ours.sendall(b"GET / HTTP/1.0\r\n\r\n")
+            return ours.recv(100)
+    except OSError:
+        return b""
+
+
 @needs_dask
-def test_the_workers_of_this_machine_take_work_from_nobody_else() -> None:
+def test_workers_listen_on_loopback_and_never_to_web_browsers_or_other_users() -> None:
+    import psutil
     from distributed import Client
 
-    with engine(workers=1) as ours:
-        address = ours.client.scheduler.address
-        assert address.startswith("tls://127.0.0.1")
-        web = ours.client.cluster.scheduler.services["dashboard"].port
-        with pytest.raises(OSError):
-            socket.create_connection(("127.0.0.1", web), timeout=2)
-        with pytest.raises((OSError, TypeError)):
-            Client(address, timeout=2)
-        with pytest.raises(OSError):
-            Client(address.replace("tls", "tcp"), timeout=2)
+    found, ended = dict[tuple[str, int], bytes](), threading.Event()
+
+    def look() -> None:
+        while not ended.is_set():
+            for process in (us := psutil.Process(), *us.children(recursive=True)):
+                with suppress(psutil.Error):
+                    ports = [one.laddr for one in process.net_connections("tcp") if one.status == psutil.CONN_LISTEN]
+                    for ip, port in {(one.ip, one.port) for one in ports} - set(found):
+                        found[ip, port] = answer(port)
+            time.sleep(0.01)
+
+    looking = threading.Thread(target=look)
+    looking.start()
+    try:
+        with engine(workers=2) as ours:
+            address = ours.client.scheduler.address
+            work = Work(toy.trial, make_grid(toy.GRID, ["snr_db"]), Draws(5))
+            assert len([*ours.results(work, [(Chunk(0, (0,), (0,)), None)])]) == 1
+            with pytest.raises((OSError, TypeError)):
+                Client(address, timeout=2)
+            with pytest.raises(OSError):
+                Client(address.replace("tls", "tcp"), timeout=2)
+    finally:
+        ended.set()
+        looking.join()
+    assert address.startswith("tls://127.0.0.1") and {ip for ip, _ in found} == {"127.0.0.1"}
+    assert not [text for text in found.values() if text.startswith(b"HTTP")]
+    assert len(found) == 5  # the scheduler, two workers and their nannies
+
+
+@pytest.mark.slow
+@needs_dask
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl is not installed")
+def test_the_script_for_slurm_sweeps_and_takes_work_from_nobody_else(tmp_path: Path) -> None:
+    from distributed import Client, Security
+
+    with socket.socket() as free:
+        free.bind(("", 0))
+        port = free.getsockname()[1]
+    page = (Path(__file__).parents[2] / "docs" / "how_to" / "sweeps.md").read_text(encoding="utf-8")
+    key, script = (block for block in re.findall(r"```text\n(.*?)```", page, re.DOTALL) if "tls" in block.lower())
+    config = write_tiny(tmp_path, sweep={"world.noise.snr_db": [0.0], "trials": 400, "chunk": 4})
+    for shown, here in (
+        ("8786", str(port)),
+        ("srun --overlap ", ""),
+        ("source ", ". ./"),
+        ("torchsar sweep CONFIG", f"{sys.executable} -m torchsar sweep {config} --out result"),
+    ):
+        script = script.replace(shown, here)
+    (tmp_path / "key.sh").write_text(key, encoding="utf-8")
+    (tmp_path / "sweep.sh").write_text(script, encoding="utf-8")
+    path = os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"]))
+    there = {**os.environ, "HOME": str(tmp_path), "PATH": path, "PYTHONPATH": str(Path(__file__).parents[2])}
+    said = tmp_path / "said.txt"
+    with said.open("w") as file:
+        job = subprocess.Popen(
+            ["bash", "sweep.sh"], cwd=tmp_path, env=there, stdout=file, stderr=file, start_new_session=True
+        )
+    try:
+        done, deadline = None, time.monotonic() + 120
+        while done is None or not done.any():
+            assert job.poll() is None and time.monotonic() < deadline, said.read_text()
+            time.sleep(0.2)
+            done = marked(tmp_path / "result")
+        for address, security in (("tcp", None), ("tls", None), ("tls", Security.temporary())):
+            with pytest.raises((OSError, TypeError)):
+                Client(f"{address}://localhost:{port}", timeout=5, security=security)
+        with pytest.raises(ConfigError, match=r"tls://\S+ does not answer"), engine(cluster=f"tls://localhost:{port}"):
+            pytest.fail("must not begin")
+    finally:
+        os.killpg(job.pid, signal.SIGKILL)

@@ -89,8 +89,6 @@ def _plugin(work: Work, threads: int, own: bool) -> Any:
             )  # a failed trial is reported only once, as one sentence
             torch.set_num_threads(threads)
             keep_freed_memory()
-            if own:
-                worker.http_server.stop()
             if own and threading.current_thread() is threading.main_thread():
                 signal.signal(signal.SIGINT, signal.SIG_IGN)
             self.work, self.programs = _on_own_gpu(work, worker.name), code(work.programs["code"])
@@ -200,8 +198,9 @@ def engine(workers: int | None = None, cluster: str | None = None, threads: int 
             "--workers starts processes on this machine and --cluster uses running ones; give one of them"
         )
     distributed = library("distributed", "cluster", "a sweep with workers or a cluster")
-    local = _local(distributed, workers or 1, threads)
-    with local if cluster is None else _remote(distributed, cluster, threads) as chosen:
+    with (
+        _local(distributed, workers or 1, threads) if cluster is None else _remote(distributed, cluster, threads)
+    ) as chosen:
         yield chosen
 
 
@@ -209,29 +208,32 @@ def engine(workers: int | None = None, cluster: str | None = None, threads: int 
 def _local(distributed: Any, workers: int, threads: int) -> Iterator[Engine]:
     from dask import config
 
+    from torchsar.study.montecarlo.servers import SchedulerWithoutHttp, WorkerWithoutHttp
+
     settings = {
         "distributed.nanny.pre-spawn-environ": dict.fromkeys(
             ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), threads
         )
         | {"OMP_WAIT_POLICY": "PASSIVE"},
         "distributed.scheduler.allowed-failures": _DEATHS,
-        # dask always starts its web servers, which are stopped then; without routes they serve no
-        # pages meanwhile
-        "distributed.scheduler.http.routes": [],
-        "distributed.worker.http.routes": [],
     }
-    wanted = {"threads_per_worker": 1, "processes": True, "dashboard_address": "127.0.0.1:0", "silence_logs": 50}
-    # processes of other users cannot give work to the workers
-    wanted |= {"security": True, "scheduler_kwargs": {"dashboard": False}}
+    # with a key of its own, processes of other users cannot give work to the workers
+    security = distributed.Security.temporary()
+    common = {"host": "127.0.0.1", "port": 0, "protocol": "tls://", "security": security}
+    of_nanny = {"worker_class": WorkerWithoutHttp, "nthreads": 1, "memory_limit": 0, "silence_logs": logging.CRITICAL}
     with config.set(settings):
         try:
-            cluster = distributed.LocalCluster(n_workers=workers, memory_limit=0, **wanted)
+            cluster = distributed.SpecCluster(
+                {i: {"cls": distributed.Nanny, "options": common | of_nanny} for i in range(workers)},
+                {"cls": SchedulerWithoutHttp, "options": common},
+                security=security,
+                silence_logs=logging.CRITICAL,
+            )
         except RuntimeError as error:
             raise ConfigError(
                 f"the worker processes did not start ({one_line(error)}); a script that starts workers is imported "
                 "again by each of them: put its call of sweep(...) below the line: if __name__ == '__main__':"
             ) from None
-        cluster.loop.add_callback(cluster.scheduler.http_server.stop)
         with cluster, distributed.Client(cluster) as client:
             yield Distributed(client, workers, threads, own=True)
 
@@ -244,7 +246,7 @@ def _remote(distributed: Any, address: str, threads: int) -> Iterator[Engine]:
         logging.getLogger(f"distributed.{part}").setLevel(logging.CRITICAL)
     try:
         client = distributed.Client(address, timeout=20)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, TypeError) as error:  # TypeError without a certificate for TLS
         raise ConfigError(
             f"--cluster {address} does not answer ({one_line(error)}); start a scheduler there, or leave --cluster out"
         ) from None

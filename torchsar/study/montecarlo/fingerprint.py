@@ -224,9 +224,8 @@ def _parts_of_code(code: CodeType) -> tuple[Any, ...]:
     # the first constant of a function is its docstring, or None if it has no docstring
     if constants and isinstance(constants[0], str) and code.co_name not in ("<lambda>", "<module>"):
         constants = (None, *constants[1:])
-    counts = (code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount, code.co_flags)
-    names = (code.co_names, code.co_varnames, code.co_freevars, code.co_cellvars)
-    return code.co_code, code.co_exceptiontable, constants, counts, names
+    parts = "code exceptiontable argcount posonlyargcount kwonlyargcount flags names varnames freevars cellvars"
+    return constants, *(getattr(code, f"co_{part}") for part in parts.split())
 
 
 def _parts_of_name(value: type | ModuleType) -> tuple[Any, ...]:
