@@ -110,9 +110,13 @@ def parser() -> argparse.ArgumentParser:
     one.add_argument("methods", nargs="*", metavar="METHOD", help=text)
     one.add_argument("--small", action="store_true", help="every fourth world with 6 trials, in two minutes")
     one.add_argument("--trials", type=_positive, default=20, metavar="N", help="trials in a world (default: 20)")
+    text = "trials in the row of a world in which a method was sure and wrong (default: as --trials)"
+    one.add_argument("--most", type=_positive, default=0, metavar="N", help=text)
     one.add_argument(
         "--draw", type=int, default=0, metavar="N", help="other scenes than the frozen ones, N = 1, 2, ..."
     )
+    text = "pulses of a recording in place of the scenes: entropy and agreement of phases, without a ranking"
+    one.add_argument("--recorded", type=_place, metavar="FILE", help=text)
     text = "record (.json), table (.tex, .txt) or figure (.pdf, .png, .svg); may be repeated"
     one.add_argument("--out", type=_place, action="append", default=[], metavar="FILE", help=text)
     for name, text in _PRINTED.items():
@@ -375,6 +379,7 @@ def _reproduce(options: argparse.Namespace) -> int:
 def _bench(options: argparse.Namespace) -> int:
     import torch
 
+    from torchsar.study.bench.blocks import remarks
     from torchsar.study.bench.entrant import MethodError
     from torchsar.study.bench.records import methods_of, read, recorded, same_scenes, score, together
     from torchsar.study.bench.show import new_files, save, table
@@ -386,16 +391,21 @@ def _bench(options: argparse.Namespace) -> int:
         torch.set_num_threads(options.threads)
     new_files(options.out)
     methods, files = methods_of(options.methods)
+    if options.recorded and (options.bench != "autofocus" or files or options.out):
+        raise ConfigError("--recorded takes `torchsar bench autofocus` and methods, no records and no --out")
     records = [recorded(options.bench) if file == "recorded" else read(Path(file)) for file in files]
-    chosen = {"trials": options.trials, "small": options.small, "draw": options.draw}
+    chosen = {"trials": options.trials, "most": options.most, "small": options.small, "draw": options.draw}
     runs = bool(methods or not files)
     this = {"this run": {"bench": options.bench, **chosen}} if runs else {}
     same_scenes({**dict(zip(files, records, strict=True)), **this})
-    if runs:
-        try:
+    try:
+        if options.recorded:
+            print(remarks(options.recorded, methods or None))
+            return 0
+        if runs:
             records.append(score(options.bench, methods or None, **chosen, say=told("worlds")))
-        except MethodError as error:
-            raise ConfigError(str(error)) from error
+    except MethodError as error:
+        raise ConfigError(str(error)) from error
     record = together(records)
     print(table(record))
     save(record, options.out)

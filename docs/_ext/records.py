@@ -404,11 +404,14 @@ class BenchTracks(SphinxDirective):
         record = recorded(self.arguments[0])
         self.env.note_dependency(str(HERE / "recorded" / f"{self.arguments[0]}.json"))
         names = [name.strip() for name in self.options["methods"].split(",")]
+        shown = {"right": "{:.0%}", "sure_wrong": "({:.0%})"}
         lines = [f"| scenes | {' | '.join(f'`{name}`' for name in names)} |", f"| --- {'| ---: ' * len(names)}|"]
-        for track in record["methods"][names[0]]["tracks"]:
-            rows = [record["methods"][name]["tracks"][track] for name in names]
-            shares = [[row[key][0] if key in row else None for key in ("right", "sure_wrong")] for row in rows]
-            texts = [f"{'-' if right is None else f'{right:.0%}'} ({wrong:.0%})" for right, wrong in shares]
+        found = [record["methods"][name]["tracks"] for name in names]
+        for track in dict.fromkeys(track for tracks in found for track in tracks):
+            rows = [{key: row[0] for key, row in tracks.get(track, {}).items() if key in shown} for tracks in found]
+            texts = [
+                " ".join(form.format(row[key]) for key, form in shown.items() if key in row) or "-" for row in rows
+            ]
             lines.append(f"| {track} | {' | '.join(texts)} |")
         return self.parse_text_to_nodes("\n".join(lines))
 

@@ -15,10 +15,11 @@ import torch
 from torch import Tensor, nn
 
 from torchsar.cli import main
-from torchsar.compensate import Sca, autofocus, sharpest_phase
-from torchsar.core import Estimate
+from torchsar.compensate import Autofocus, Sca, autofocus, sharpest_phase
+from torchsar.core import Chain, Estimate
 from torchsar.metrics import phase_rmse
-from torchsar.study.bench import entrant, frame, methods, records, show
+from torchsar.repair import RemoveConstant
+from torchsar.study.bench import blocks, entrant, frame, methods, records, show
 from torchsar.study.bench.frame import Bench, Entry, World, scored
 from torchsar.study.bench.learned import networks, trained
 from torchsar.study.bench.scenes import Scenes
@@ -218,12 +219,87 @@ def test_cheats_are_exposed() -> None:
     )
 
 
-def test_a_refusal_is_named() -> None:
-    def refuses(x: Tensor) -> Estimate:
+def test_a_refusal_of_a_built_in_method_is_named_and_an_error_of_an_own_one_ends_the_run() -> None:
+    def refuses(data: Any) -> Estimate:
         raise ValueError("not for me")
 
-    rows = few(refuses)
+    rows = scored(methods.BENCH, [Entry("refuses", refuses, SOME, methods.PHASES)], 6)["refuses"]
     assert rows["worlds"]["noise"]["refused"] == "not for me" and rows["all"]["ok"][0] == 0
+    with pytest.raises(entrant.MethodError, match="the method refuses failed with ValueError: not for me"):
+        few(refuses)
+
+
+def test_a_chain_is_entered_with_its_last_estimate() -> None:
+    leaking = [w for w in WORLDS if w.label == "leakage 0 dB, 10 dB"]
+    repaired = Chain(repair=RemoveConstant(), phase=Autofocus())
+    assert few(autofocus, leaking)["all"]["right"][0] == 0
+    assert few(repaired, leaking)["all"]["ok"][0] == few(repaired, leaking)["all"]["right"][0] == 1
+    with pytest.raises(entrant.MethodError, match="no stage of the chain repair estimates phase_rad"):
+        few(Chain(repair=RemoveConstant()), leaking)
+
+
+def test_rows_of_worlds_with_a_wrong_trial_have_more_trials() -> None:
+    entry = Entry("mine", entrant.entrant(of_lags, "phase_rad", per_pulse=True), SOME[:2], methods.PHASES)
+    rows = scored(methods.BENCH, [entry], 4, most=8)["mine"]
+    counts = {world: row["trials"] for world, row in rows["worlds"].items()}
+    assert counts == {"noise": 8, "direct, 10 dB": 8 if rows["worlds"]["direct, 10 dB"]["sure_wrong"][0] else 4}
+    assert rows["all"]["trials"] == 8 and rows["tracks"]["nothing to be found"]["trials"] == 4
+
+
+class ByHeart:
+    """The frozen phases, with errors of the size of the bound, by the data they belong to."""
+
+    def __init__(self, worlds: list[World]) -> None:
+        noise = torch.Generator().manual_seed(1)
+        self.known = {}
+        for block in (block for world in worlds for block in world.blocks(6)):
+            for x, phase in zip(block.data.data, (block.truth or {})["phase_rad"].nan_to_num(), strict=True):
+                error = 0.12 * torch.randn(phase.shape, generator=noise)
+                self.known[float(x.abs().sum())] = phase + error
+
+    def __call__(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        found = [self.known.get(float(part.abs().sum())) for part in x]
+        ok = torch.tensor([phase is not None for phase in found])
+        phase = torch.stack([torch.zeros(x.shape[1]) if phase is None else phase for phase in found])
+        return phase, torch.full_like(phase, 0.12), ok
+
+
+def of_neighbours(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Sure of all trials of a world if it is sure of most."""
+    found = autofocus(x)
+    return found["phase_rad"], found.std["phase_rad"], (found.ok.double().mean() > 0.5).expand(len(x))
+
+
+def test_what_was_learnt_by_heart_is_worth_nothing_on_other_draws() -> None:
+    cheat, world = ByHeart(SOME[1:2]), SOME[1:2]
+    frozen = few(cheat, world)["all"]
+    assert frozen["merit"][0] == 1 and 0.5 < frozen["over_bound"][0] < 5 and 0.5 < frozen["calibration"] < 2
+    assert few(cheat, world, draw=1)["all"]["right"][0] == 0
+    assert few(autofocus, world, draw=1)["all"]["merit"][0] == few(autofocus, world)["all"]["merit"][0] == 1
+
+
+def test_scores_without_neighbours_show_what_a_method_reads_from_them() -> None:
+    half = [w for w in WORLDS if w.label == "scintillating 8 points, 0 dB"]
+    honest, cheat = (without_time(few(method, half)["all"]) for method in (autofocus, of_neighbours))
+    alone = without_time(few(of_neighbours, half, batch=1)["all"])
+    assert cheat["ok"] != honest["ok"] and alone["ok"] == honest["ok"]
+
+
+def test_recorded_pulses_get_remarks_and_no_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (block,) = SOME[1].blocks(1)
+    profiles = block.data.data[0].mT.numpy()
+    np.savez(tmp_path / "mine.npz", profiles=profiles, range_step_m=1.0, bandwidth_hz=150e6, prf_hz=100.0)
+    monkeypatch.setitem(blocks.BLOCKS, blocks.checksum_of(tmp_path / "mine.npz"), "a block of mine")
+    words = ["bench", "autofocus", "uncorrected", "autofocus", "--recorded", str(tmp_path / "mine.npz")]
+    assert main(words) == 0
+    title, head, none, found = capsys.readouterr().out.splitlines()
+    assert title == "mine.npz: a block of mine; without a truth, so that nothing is ranked"
+    assert head.split() == ["method", "entropy", "ok", "from", "others", "from", "itself"]
+    assert float(found.split()[1]) < float(none.split()[1]) - 0.5
+    assert float(found.split()[4]) < 0.05 and float(none.split()[4]) > 1 and found.split()[3] == none.split()[3]
+    assert main([*words[:2], "recorded", *words[2:]]) == 2 and "no records" in capsys.readouterr().err
 
 
 @pytest.fixture
@@ -243,7 +319,7 @@ def test_the_command_scores_beside_records(
     out = [word for name in ("mine.json", "mine.tex", "mine.pdf", "mine.txt") for word in ("--out", name)]
     assert main(["bench", "autofocus", "my_methods:zero", "sca", "--trials", "6", *out]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("torchsar bench autofocus, version 2026.1, checksum ")
+    assert lines[0].startswith("torchsar bench autofocus, version 2026.2, checksum ")
     assert [line.split()[0] for line in lines[1:]] == ["method", "sca", "my_methods:zero"]
     record = json.loads((tmp_path / "mine.json").read_text())
     assert set(record["methods"]) == {"sca", "my_methods:zero"} and record["version"] == records.VERSION
@@ -270,6 +346,10 @@ def named(x):
 
 def fails(x):
     return 1 / 0
+
+
+def refuses(x):
+    raise ValueError("not for me")
 """
 
 
@@ -291,6 +371,7 @@ def fails(x):
         (["mistaken:Width"], "Width() without arguments (an instance may be given in its place) failed with TypeError"),
         (["mistaken:boolean"], "std of shape (6, 128), got torch.bool of shape (6,); the order is (value, std, ok)"),
         (["mistaken:named"], "a method must return phase_rad of shape (6, 128), or (value, std, ok), got dict"),
+        (["mistaken:refuses"], "the method refuses failed with ValueError: not for me (line 19 of "),
         (["mistaken:fails"], "the method fails failed with ZeroDivisionError: division by zero (line 15 of "),
     ],
 )
@@ -329,6 +410,13 @@ def test_other_benchmarks_take_methods_of_users() -> None:
     world = next(w for w in first.worlds if w.label == "own, 10 dB")
     run = entrant.entrant(lambda x: np.zeros(len(x)), "doppler_hz")
     rows = scored(one, [frame.in_worlds_of(replace(first, worlds=[world]), "zero", run)], 6)["zero"]
+    path = records.bench("path")
+    strip = next(entry for entry in path.entries() if entry.name == "StripAutofocus")
+    worlds = [w for w in strip.worlds if w.label == "strip, 3 mm, 0 dB"]
+    for method in (lambda x: torch.zeros(x.shape[:-1]), lambda x, transmitter_m: 0 * transmitter_m[..., 0]):
+        run = entrant.entrant(method, "phase_rad", path.per_pulse)
+        found = scored(path, [Entry("mine", run, worlds, strip.judged)], 1)["mine"]
+        assert found["all"]["right"][0] == 0 and found["all"]["error"][0] > 0.5
     assert 5 < rows["all"]["error"][0] < 60 and show.cells({"methods": {"zero": rows}})[0][0] == "method"
 
 

@@ -23,7 +23,18 @@ VERSIONS = {
         "repair": "14cbcc11ddfb",
         "channels": "70c77c8adc13",
         "path": "daf62b495961",
-    }
+    },
+    "2026.2": {
+        "autofocus": "b68d99982081",
+        "alignment": "31b3dc061dd8",
+        "doppler": "f37d8ca9dfb7",
+        "velocity": "4d35cc4596b8",
+        "radial": "b0b91b789f43",
+        "rotation": "d06ea4491fa6",
+        "repair": "14cbcc11ddfb",
+        "channels": "70c77c8adc13",
+        "path": "42965840b56a",
+    },
 }
 SLOW = ("velocity", "repair", "channels")  # their scenes take seconds
 NAMES = [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in PLACES]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -13,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Outcome, Stage, is_out_of_memory
+from torchsar.core import Chain, Estimate, Outcome, Stage, is_out_of_memory
 from torchsar.study.bench.frame import samples
 from torchsar.study.settings.errors import ConfigError, one_line, own_line
 
@@ -23,14 +24,11 @@ class MethodError(TypeError):
 
 
 def _called(what: str, function: Callable[..., Any], *parts: Any, **values: Any) -> Any:
-    """Call what a user wrote; its errors become one sentence with the own line.
-
-    A ValueError of a call is the way to refuse data, and passes.
-    """
+    """Call what a user wrote; its errors become one sentence with the own line."""
     try:
         return function(*parts, **values)
     except Exception as error:
-        if isinstance(error, (MethodError, ValueError)) or is_out_of_memory(error):
+        if isinstance(error, MethodError) or is_out_of_memory(error):
             raise
         told = f"{type(error).__name__}: {one_line(error) or 'no message'}{own_line(error)}"
         raise MethodError(f"{what} failed with {told}") from error
@@ -52,9 +50,10 @@ def loaded(place: str) -> Any:
 def entrant(method: Any, name: str, per_pulse: bool = False) -> Callable[..., Estimate]:
     """Make a method one that takes the data of a world and returns an Estimate.
 
-    A class is called without arguments. A stage is given the signal, and any other method the
-    samples: a tensor, or an array if that is what it needs. It returns an Estimate, the value, or a
-    tuple (value, std, ok), of which the last two may be left out or None.
+    A class is called without arguments. A stage or a chain is given the signal, and any other
+    method the samples: a tensor, or an array if that is what it needs, and those of the values of
+    a world that its arguments name. It returns an Estimate, the value, or a tuple (value, std, ok),
+    of which the last two may be left out or None. Of a chain counts the last estimate of the value.
 
     Args:
         method: Class, stage, module or function.
@@ -75,10 +74,12 @@ def entrant(method: Any, name: str, per_pulse: bool = False) -> Callable[..., Es
     called = f"the method {getattr(made, '__name__', type(made).__name__)}"
     if isinstance(made, Stage):
         return partial(_called, called, made)
+    if isinstance(made, Chain):
+        return partial(_called, called, partial(_last, made, name))
     kinds: list[Callable[[Tensor], Any]] = [torch.Tensor.clone, lambda x: x.detach().cpu().numpy().copy()]
 
     def run(data: Any, **values: Any) -> Estimate:
-        x = samples(data)
+        x, values = samples(data), _taken(made, values)
         try:
             out = _called(called, made, kinds[0](x), **values)
         except Exception as first:
@@ -97,6 +98,23 @@ def entrant(method: Any, name: str, per_pulse: bool = False) -> Callable[..., Es
         return _estimate(out, name, x, per_pulse)
 
     return run
+
+
+def _taken(method: Any, values: dict[str, Any]) -> dict[str, Any]:
+    """Those of the values that a method takes."""
+    try:
+        parameters = inspect.signature(getattr(method, "forward", method)).parameters
+    except ValueError:  # a function in C without a signature
+        return {}
+    named = any(one.kind is one.VAR_KEYWORD for one in parameters.values())
+    return {name: value for name, value in values.items() if named or name in parameters}
+
+
+def _last(chain: Chain, name: str, data: Any, **_: Any) -> Estimate:
+    estimates = [found for found in chain.trace(data).estimates.values() if name in found.value]
+    if not estimates:
+        raise MethodError(f"no stage of the chain {', '.join(chain.stages)} estimates {name}")
+    return estimates[-1]
 
 
 def _holds_arrays(out: Any) -> bool:

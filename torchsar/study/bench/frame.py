@@ -104,8 +104,10 @@ class World:
             return [self.draw(min(BLOCK, trials - first), seed + first) for first in range(0, trials, BLOCK)]
 
 
-def rms(x: Tensor) -> Tensor:
-    """Rms over all dimensions but the first, (trial, ...) -> (trial,)."""
+def rms(x: Tensor, truth: Tensor | None = None) -> Tensor:
+    """Rms over all dimensions but the first, (trial, ...) -> (trial,), where the truth is known."""
+    if truth is not None and truth.shape == x.shape:
+        return x.double().where(truth.isfinite(), torch.nan).reshape(len(x), -1).square().nanmean(-1).sqrt()
     return x.double().reshape(len(x), -1).square().mean(-1).sqrt()
 
 
@@ -142,14 +144,12 @@ class Entry:
         run: The method, called with the data of a batch and its values.
         worlds: Worlds in which it is tried.
         judged: What is judged.
-        share: Share of the trials that its cost allows.
     """
 
     name: str
     run: Callable[..., Any]
     worlds: Sequence[World]
     judged: Sequence[Quantity]
-    share: float = 1.0
 
 
 Numbers = dict[str, Tensor]
@@ -198,7 +198,7 @@ def counted(entry: Entry, batch: Batch, found: Estimate, scores: Scores | None =
         wrong, right = wrong | far, right & ~far
         numbers.setdefault("error", error)
         if quantity.predicted and std is not None:
-            deviation = rms(std).cpu()
+            deviation = rms(std, batch.truth[name]).cpu()
             wrong = wrong | (error > SURE * deviation + quantity.floor)
             numbers |= {f"error:{name}": error[ok], f"std:{name}": deviation[ok]}
     merit = torch.where(ok, 1 - 2 * wrong.double(), 0.5 * right.double())
@@ -302,6 +302,7 @@ def scored(
     entries: Sequence[Entry],
     trials: int,
     *,
+    most: int = 0,
     small: bool = False,
     draw: int = 0,
     batch: int = BLOCK,
@@ -313,6 +314,8 @@ def scored(
         bench: Benchmark.
         entries: Methods.
         trials: Number of trials in a world.
+        most: Number of trials in the row of a world in which a method was sure and wrong; tracks
+            and sums have `trials` of each world.
         small: Whether to leave out worlds: every fourth is tried, with at most 6 trials.
         draw: Number of other scenes than the frozen ones, from 1 on.
         batch: Largest number of trials that a method is given at once.
@@ -322,19 +325,21 @@ def scored(
         Rows by method: `worlds`, `tracks`, `all`, and `memory`, the peak in sizes of the data.
     """
     worlds = list({id(world): world for entry in entries for world in entry.worlds}.values())
-    worlds = worlds[::4] if small else worlds
+    worlds, trials, most = (worlds[::4], min(trials, 6), 0) if small else (worlds, trials, most)
     parts: dict[str, dict[str, Numbers]] = {entry.name: {} for entry in entries}
     methods: dict[str, dict[str, Any]] = {entry.name: {"worlds": {}, "tracks": {}, "all": None} for entry in entries}
     for world in worlds:
         say(world.label, len(worlds))
-        counts = {e.name: _count(e, trials, small) for e in entries if any(world is own for own in e.worlds)}
-        drawn = {count: sealed(world.blocks(count, draw=draw)) for count in set(counts.values())}
-        for entry in (entry for entry in entries if entry.name in counts):
-            (blocks, truth), method = drawn[counts[entry.name]], methods[entry.name]
+        drawn = sealed(world.blocks(trials, draw=draw))
+        for entry in (entry for entry in entries if any(world is own for own in entry.worlds)):
+            method = methods[entry.name]
             if "memory" not in method:
-                method["memory"] = _memory(entry, blocks[0])
-            found, sentence = tried(entry, blocks, truth, bench.scores, batch)
+                method["memory"] = _memory(entry, drawn[0][0])
+            found, sentence = tried(entry, *drawn, bench.scores, batch)
             parts[entry.name][world.label] = numbers = joined(found)
+            if most > trials and numbers["sure_wrong"].any():
+                more = sealed(world.blocks(most, draw=draw))
+                numbers = joined(tried(entry, *more, bench.scores, batch)[0])
             method["worlds"][world.label] = row(numbers) | ({"refused": sentence} if sentence else {})
     for entry in entries:
         mine, method = parts[entry.name], methods[entry.name]
@@ -343,10 +348,6 @@ def scored(
             method["tracks"][track] = row(joined([mine[label] for label in mine if tracks[label] == track]))
         method["all"] = row(joined(list(mine.values()))) if mine else None
     return methods
-
-
-def _count(entry: Entry, trials: int, small: bool) -> int:
-    return min(trials, 6) if small else max(min(trials, 20), round(trials * entry.share))
 
 
 def _memory(entry: Entry, batch: Batch) -> float | None:
@@ -363,4 +364,4 @@ def _memory(entry: Entry, batch: Batch) -> float | None:
 
 def in_worlds_of(entry: Entry, name: str, run: Callable[..., Any]) -> Entry:
     """Another method in the worlds of an entry."""
-    return replace(entry, name=name, run=run, share=1.0)
+    return replace(entry, name=name, run=run)

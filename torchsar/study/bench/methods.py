@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,9 +19,10 @@ from torchsar.compensate import (
     SharpestPhase,
     sharpest_phase,
 )
-from torchsar.core import Estimate, Signal, cis
+from torchsar.core import Chain, Estimate, Signal, cis
 from torchsar.metrics import entropy
 from torchsar.optim import adam
+from torchsar.repair import RemoveConstant
 from torchsar.study.bench.entrant import entrant
 from torchsar.study.bench.frame import Bench, Entry
 from torchsar.study.bench.learned import trained
@@ -85,7 +87,8 @@ def entries() -> list[Entry]:
         "phase_polish": PhasePolish(),
         "link_phases": LinkPhases(),
     }
-    simple: dict[str, Callable[[Tensor], Tensor]] = {
+    simple: dict[str, Callable[..., Any]] = {
+        "autofocus:remove_constant": Chain(repair=RemoveConstant(), phase=Autofocus()),
         "textbook_pga": textbook_pga,
         "adam_entropy": adam_entropy,
         "uncorrected": uncorrected,

@@ -21,7 +21,7 @@ from torchsar.study.bench.entrant import entrant, loaded
 from torchsar.study.bench.frame import BLOCK, Batch, Bench, Entry, counted, in_worlds_of, row, samples, scored
 from torchsar.study.settings.errors import ConfigError
 
-VERSION = "2026.1"
+VERSION = "2026.2"
 HERE = Path(__file__).parent
 # where the benchmarks are
 PLACES = {
@@ -102,6 +102,7 @@ def score(
     methods: Mapping[str, Any] | None = None,
     *,
     trials: int = 20,
+    most: int = 0,
     small: bool = False,
     draw: int = 0,
     batch: int = BLOCK,
@@ -115,6 +116,7 @@ def score(
             None in place of one means the built-in one of this name. A name "BUILT-IN=mine" takes
             the worlds of a built-in method, and not those of the first one.
         trials: Number of trials in a world.
+        most: Number of trials in worlds in which a method was sure and wrong, if it is larger.
         small: Whether to try every fourth world only, with at most 6 trials.
         draw: Number of other scenes than the frozen ones, from 1 on.
         batch: Largest number of trials that a method is given at once.
@@ -124,26 +126,14 @@ def score(
         The record, which JSON can hold.
     """
     one = bench(name)
-    known = {entry.name: entry for entry in one.entries()}
-    first = next(iter(known.values()))
-    entries: list[Entry] = []
-    for label, method in (dict.fromkeys(known) if methods is None else methods).items():
-        if method is None and label not in known:
-            module, colon, _ = label.rpartition("=")[2].partition(":")
-            missing = f"there is no {module}.py in the working folder; " if colon and module not in known else ""
-            told = f"{missing}give package.module:Name, or one of {', '.join(known)}"
-            raise ConfigError(f"{label!r} is no method of {name}: {told}")
-        if method is None:
-            entries.append(known[label])
-        else:
-            like = known.get(label.partition("=")[0], first)
-            entries.append(in_worlds_of(like, label, entrant(method, like.judged[0].name, one.per_pulse)))
-    found = scored(one, entries, trials, small=small, draw=draw, batch=batch, say=say)
+    entries = entries_of(one, methods)
+    found = scored(one, entries, trials, most=most, small=small, draw=draw, batch=batch, say=say)
     return {
         "bench": name,
         "version": VERSION,
         "checksum": checksum(name),
         "trials": trials,
+        "most": most,
         "small": small,
         "draw": draw,
         "made": {
@@ -155,6 +145,25 @@ def score(
         },
         "methods": found,
     }
+
+
+def entries_of(one: Bench, methods: Mapping[str, Any] | None = None) -> list[Entry]:
+    """Methods as entries of a benchmark, see `score`."""
+    known = {entry.name: entry for entry in one.entries()}
+    first = next(iter(known.values()))
+    entries: list[Entry] = []
+    for label, method in (dict.fromkeys(known) if methods is None else methods).items():
+        if method is None and label not in known:
+            module, colon, _ = label.rpartition("=")[2].partition(":")
+            missing = f"there is no {module}.py in the working folder; " if colon and module not in known else ""
+            told = f"{missing}give package.module:Name, or one of {', '.join(known)}"
+            raise ConfigError(f"{label!r} is no method of {one.name}: {told}")
+        if method is None:
+            entries.append(known[label])
+        else:
+            like = known.get(label.partition("=")[0], first)
+            entries.append(in_worlds_of(like, label, entrant(method, like.judged[0].name, one.per_pulse)))
+    return entries
 
 
 def recorded(name: str) -> Record:

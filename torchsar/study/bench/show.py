@@ -80,10 +80,16 @@ def about(record: Record) -> str:
 
 def table(record: Record, ends: bool = False) -> str:
     """Text of a table of all methods, with the intervals of the values if `ends`."""
-    lines = [[cell if ends else cell.partition(" (")[0] for cell in line] for line in cells(record)]
+    return aligned(
+        about(record), [[cell if ends else cell.partition(" (")[0] for cell in line] for line in cells(record)]
+    )
+
+
+def aligned(title: str, lines: Sequence[Sequence[str]]) -> str:
+    """Text of a title and of cells in columns."""
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     padded = ([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])] for line in lines)
-    return "\n".join([about(record), *map("  ".join, padded)])
+    return "\n".join([title, *map("  ".join, padded)])
 
 
 def latex(record: Record) -> str:

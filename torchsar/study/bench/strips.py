@@ -248,7 +248,6 @@ def entries() -> list[Entry]:
                 for snr in (-10.0, 10.0)
             ],
             [Quantity("doppler_hz", 0.25 * float(FAST.azimuth_rate_hz_s(700e3, 7000.0)) * 0.1, floor=0.5)],
-            share=0.3,
         ),
         Entry("PointDoppler", PointDoppler(FAST), POINT_WORLDS, [Quantity("doppler_hz", 60.0, floor=0.5)]),
     ]
