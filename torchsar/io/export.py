@@ -9,11 +9,11 @@ from torch import nn
 
 from torchsar.core import Recording, Signal
 from torchsar.focus import PathImage
+from torchsar.io.cphd import write_cphd
 from torchsar.io.geometry import frame_of
 from torchsar.io.geotiff import write_geotiff
 from torchsar.io.netcdf import write_netcdf
-from torchsar.io.write_cphd import write_cphd
-from torchsar.io.write_sicd import write_sicd
+from torchsar.io.sicd import write_sicd
 from torchsar.radar import LocalFrame
 
 

@@ -10,8 +10,9 @@ import torch
 
 from torchsar.core import Recording, refuse_non_finite, unit_phasor
 from torchsar.io.fields import joined, parted, refuse_implausible
-from torchsar.io.inverse import history_radar
+from torchsar.io.history import history_radar
 from torchsar.radar import AntennaPath, range_profiles
+from torchsar.repair.analytic import delayed
 
 
 def fmcw_recording(
@@ -74,7 +75,7 @@ def fmcw_recording(
     x = np.asarray(beat)
     if order == "real" and x.dtype.kind != "c":
         # the frequencies of a cosine have both signs, of which those of delays above zero are kept
-        x, beat_sign = _analytic(x), 1
+        x, beat_sign = delayed(torch.from_numpy(x.astype(float)), torch.zeros(()), analytic=True).numpy(), 1
         x = x.conj() if slope_hz_s < 0 else x
     elif x.dtype.kind != "c":
         if x.shape[-1:] != (2,):
@@ -115,12 +116,3 @@ def fmcw_recording(
         radar = replace(radar, pulse_s=n / sampling_hz)
     aux: dict[str, Any] = {"frequency_hz": frequency, **antennas.side_data()}
     return Recording.from_arrays(profiles, radar, what="beat", **aux)
-
-
-def _analytic(x: np.ndarray) -> np.ndarray:
-    """Analytic signal of real samples along the last dim."""
-    n = x.shape[-1]
-    spectrum = np.fft.fft(x.astype(float))
-    spectrum[..., 1 : (n + 1) // 2] *= 2
-    spectrum[..., n // 2 + 1 :] = 0
-    return np.fft.ifft(spectrum)

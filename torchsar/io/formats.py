@@ -11,8 +11,7 @@ import torch
 from torchsar.core import Recording, Signal
 from torchsar.io.cphd import read_cphd
 from torchsar.io.fields import archive, refuse_absent
-from torchsar.io.inverse import read_inverse
-from torchsar.io.path import read_path
+from torchsar.io.history import read_inverse, read_path
 from torchsar.io.recorded import read_stripmap
 from torchsar.io.sicd import read_sicd
 

@@ -25,8 +25,7 @@ from torchsar.core import Recording, StoredArray
 from torchsar.io.containers import BlockArray, Container, flat_array, open_container
 from torchsar.io.extras import write_whole
 from torchsar.io.fields import Described, Level, complex_type, joined, naming, parted
-from torchsar.io.inverse import describe_inverse
-from torchsar.io.path import describe_path
+from torchsar.io.history import describe_inverse, describe_path
 from torchsar.io.recorded import describe_stripmap
 from torchsar.spelling import did_you_mean
 

@@ -237,8 +237,8 @@ class StripImage:
         for key, value in identity.items():
             if canonical(self.identity.get(key)) != canonical(value):
                 raise ValueError(
-                    f"{self.path} was made with another {key}, {_short(self.identity.get(key))} instead of "
-                    f"{_short(value)}; choose another folder"
+                    f"{self.path} was made with another {key}, {self.identity.get(key)!s:.100} instead "
+                    f"of {value!s:.100}; choose another folder"
                 )
 
     def is_finished(self, lines: slice) -> bool:
@@ -327,8 +327,3 @@ def samples_checksum(samples: torch.Tensor) -> int:
         The checksum.
     """
     return zlib.crc32(samples.contiguous().view(torch.uint8).numpy().data)
-
-
-def _short(value: Any) -> str:
-    text = str(value)
-    return text if len(text) < 100 else f"{text[:100]}..."
