@@ -20,6 +20,7 @@ import numpy as np
 # _LONGEST_HEADER: largest number of bytes before its numbers
 _MAGIC, _LONGEST_HEADER = b"\x93NUMPY", 1 << 16
 _AGAIN = "copy or save the file again"
+Slices = tuple[slice, ...]
 
 
 def machine_memory_bytes() -> int | None:
@@ -61,17 +62,16 @@ class StoredArray:
         what: Path of the file and name of the array, for messages.
         shape: Shape of the array.
         dtype: Type of its numbers in the file.
-        opened: Function that opens the array as a stream in the format .npy.
-        plain: Path of the file that holds the numbers without compression, the position of the
-            first of them in bytes, and whether the first dimension is contiguous; None for a
-            compressed array.
+        part: Function that reads the part which a slice for each of the first dimensions gives, and
+            the whole array without slices.
+        compressed: Whether it reads the whole array for every part.
     """
 
     what: str
     shape: tuple[int, ...]
     dtype: np.dtype
-    opened: Callable[[], IO[bytes]]
-    plain: tuple[Path, int, bool] | None = None
+    part: Callable[[Slices], np.ndarray]
+    compressed: bool = False
 
     @property
     def described(self) -> str:
@@ -94,17 +94,16 @@ class StoredArray:
         if kinds and self.dtype.kind not in kinds:
             raise ValueError(f"{self.what} must hold {'' if 'c' in kinds else 'real '}numbers, got {self.described}")
         refuse_beyond_memory(self.what, self.shape, self.dtype)
-        try:
-            with self.opened() as stream, np.errstate(over="ignore"):
-                return np.lib.format.read_array(stream, allow_pickle=False).astype(self._kept, copy=False)
-        except Exception as error:  # numpy and zipfile raise errors of many kinds
-            raise ValueError(f"{self.what} cannot be loaded ({_reason(error)}); {_AGAIN}") from None
+        return self.read()
 
-    @property
-    def _kept(self) -> np.dtype:
-        """Type of the numbers after loading: native byte order, and at most double precision."""
+    def read(self, part: Slices = ()) -> np.ndarray:
+        """Read a part of the array, given by a slice for each of the first dimensions, as `load`
+        does.
+        """
         widest = np.dtype({"f": np.float64, "c": np.complex128}.get(self.dtype.kind, self.dtype))
-        return widest if self.dtype.itemsize > widest.itemsize else self.dtype.newbyteorder("=")
+        kept = widest if self.dtype.itemsize > widest.itemsize else self.dtype.newbyteorder("=")
+        with np.errstate(over="ignore"):
+            return np.asarray(self.part(part)).astype(kept, copy=False)
 
     def rows(self, first: int, last: int) -> np.ndarray:
         """Load a part of the array along its first dimension; nothing else is in memory.
@@ -119,21 +118,12 @@ class StoredArray:
         Raises:
             ValueError: If the array is compressed, or the file was cut off.
         """
-        if self.plain is None:
+        if self.compressed:
             raise ValueError(
                 f"{self.what} is compressed, so that its rows cannot be read one by one; save it by numpy.savez, which "
                 "does not compress"
             )
-        path, begin, turned = self.plain
-        row = math.prod(self.shape[1:])
-        if path.stat().st_size < begin + self.shape[0] * row * self.dtype.itemsize:
-            raise ValueError(f"{self.what} was cut off while it was read; {_AGAIN}")
-        if turned:
-            part: np.ndarray = np.array(np.memmap(path, self.dtype, "r", begin, self.shape, "F")[first:last], order="C")
-        else:  # read into memory, since the pages of a memory map count as memory of the process
-            part = np.fromfile(path, self.dtype, (last - first) * row, offset=begin + first * row * self.dtype.itemsize)
-        with np.errstate(over="ignore"):
-            return part.reshape(last - first, *self.shape[1:]).astype(self._kept, copy=False)
+        return self.read((slice(first, last),))
 
 
 class ArrayFile(Mapping[str, StoredArray]):
@@ -202,8 +192,33 @@ class ArrayFile(Mapping[str, StoredArray]):
         held, needed = size - start.tell(), math.prod(shape) * dtype.itemsize
         if min(shape, default=0) < 0 or held != needed:
             raise ValueError(f"{what} is damaged: {dtype} of shape {shape} needs {needed} bytes, got {held}; {_AGAIN}")
-        turned = turned and len(shape) > 1
-        return StoredArray(what, shape, dtype, opened, (self.path, begin, turned) if stored else None)
+
+        def part(slices: Slices) -> np.ndarray:
+            if slices and stored:
+                return self._rows(what, begin, shape, dtype, turned and len(shape) > 1, slices)
+            try:
+                with opened() as stream:
+                    return np.lib.format.read_array(stream, allow_pickle=False)[slices]
+            except Exception as error:  # numpy and zipfile raise errors of many kinds
+                raise ValueError(f"{what} cannot be loaded ({_reason(error)}); {_AGAIN}") from None
+
+        return StoredArray(what, shape, dtype, part, not stored)
+
+    def _rows(
+        self, what: str, begin: int, shape: tuple[int, ...], dtype: np.dtype, turned: bool, slices: Slices
+    ) -> np.ndarray:
+        """Read a part of an array that begins at a byte; `turned` if its first dimension is
+        contiguous.
+        """
+        first, last, _ = slices[0].indices(shape[0])
+        row = math.prod(shape[1:])
+        if self.path.stat().st_size < begin + shape[0] * row * dtype.itemsize:
+            raise ValueError(f"{what} was cut off while it was read; {_AGAIN}")
+        if turned:
+            return np.array(np.memmap(self.path, dtype, "r", begin, shape, "F")[slices], order="C")
+        # read into memory, since the pages of a memory map count as memory of the process
+        part = np.fromfile(self.path, dtype, (last - first) * row, offset=begin + first * row * dtype.itemsize)
+        return part.reshape(last - first, *shape[1:])[(slice(None), *slices[1:])]
 
     def __contains__(self, name: object) -> bool:
         return name in self._members

@@ -15,60 +15,16 @@ from typing import Any
 
 import numpy as np
 
-from torchsar.core import ArrayFile
-from torchsar.core.stored import refuse_beyond_memory
+from torchsar.core import ArrayFile, StoredArray
+from torchsar.core.stored import Slices
 from torchsar.io.extras import library, reading
 from torchsar.io.fields import complex_type, joined, refuse_absent
 from torchsar.io.matlab import MatlabFile
 from torchsar.radar.track import read_table
 from torchsar.spelling import did_you_mean
 
-Slices = tuple[slice, ...]
 # lower-case names of the real and the imaginary part in a compound type
 _PARTS = (("r", "i"), ("re", "im"), ("real", "imag"), ("i", "q"))
-
-
-@dataclass(frozen=True)
-class BlockArray:
-    """Array of numbers in a file, of which parts can be read.
-
-    Args:
-        path: Path of the file.
-        kind: Format of the file, for messages.
-        name: Name of the array in the file; empty if it has none.
-        shape: Shape of the array.
-        dtype: Type of its numbers, real or complex.
-        part: Function that reads the part given by one slice per dimension.
-    """
-
-    path: Path
-    kind: str
-    name: str
-    shape: tuple[int, ...]
-    dtype: np.dtype
-    part: Callable[[Slices], np.ndarray]
-
-    @property
-    def what(self) -> str:
-        """Path of the file and name of the array, for messages."""
-        return f"{self.path}: {self.name}" if self.name else str(self.path)
-
-    def read(self, part: Slices = ()) -> np.ndarray:
-        """Read the array or a part of it.
-
-        Args:
-            part: A slice for each of the first dimensions; by default the whole array.
-
-        Returns:
-            The numbers in the byte order of this machine.
-
-        Raises:
-            ValueError: If the file is damaged or cut off.
-        """
-        with reading(self.path, self.kind):
-            if not part:
-                refuse_beyond_memory(self.what, self.shape, self.dtype)
-            return np.asarray(self.part(part)).astype(self.dtype.newbyteorder("="), copy=False)
 
 
 @dataclass(frozen=True)
@@ -88,7 +44,7 @@ class Container:
     find: Callable[[str], tuple[Any, Callable[[Slices], np.ndarray]]]
     names: Callable[[], Iterable[str]]
 
-    def array(self, name: str | None) -> BlockArray:
+    def array(self, name: str | None) -> StoredArray:
         """Return an array by its name.
 
         Args:
@@ -118,17 +74,18 @@ class Container:
         if not isinstance(dtype, np.dtype) or shape is None:
             raise ValueError(f"{what} must hold numbers, got {type(array).__name__}")
         fields = dtype.names or ()
-        if len(fields) == 2 and tuple(field.lower() for field in fields) in _PARTS:
+        paired = len(fields) == 2 and tuple(field.lower() for field in fields) in _PARTS
+        if paired:
             dtype = complex_type(np.result_type(*(dtype[field] for field in fields)))
-
-            def complex_part(slices: Slices) -> np.ndarray:
-                held = part(slices)
-                return joined(*(held[field] for field in fields))
-
-            return BlockArray(self.path, self.kind, name, tuple(shape), dtype, complex_part)
         if dtype.kind not in "iufc":
             raise ValueError(f"{what} must hold numbers, got {dtype}")
-        return BlockArray(self.path, self.kind, name, tuple(shape), dtype, part)
+
+        def read(slices: Slices) -> np.ndarray:
+            with reading(self.path, self.kind):
+                held = part(slices)
+                return joined(*(held[field] for field in fields)) if paired else held
+
+        return StoredArray(what, tuple(shape), dtype, read)
 
 
 def open_container(path: Path, stack: ExitStack) -> Container | None:
@@ -161,7 +118,12 @@ def open_container(path: Path, stack: ExitStack) -> Container | None:
         return _hdf5(path, stack, start.startswith(b"MATLAB"))
     if start.startswith((b"\x93NUMPY", b"PK\x03\x04")):
         held = ArrayFile(path)
-        return Container(path, "numpy", lambda name: _later(held[name], held[name].load), lambda: held)
+        return Container(
+            path,
+            "numpy",
+            lambda name: _later(x, x.load) if (x := held[name]).compressed else (x, x.part),
+            lambda: held,
+        )
     if path.suffix.lower() in (".csv", ".txt"):
         columns = read_table(path)
         return Container(path, "table", lambda name: _later(x := _columns(columns, name), lambda: x), lambda: columns)
@@ -176,7 +138,7 @@ def _columns(columns: Mapping[str, np.ndarray], name: str) -> np.ndarray:
 
 def flat_array(
     path: Path, dtype: np.dtype, shape: tuple[int, ...], header: int = 0, prefix: int = 0, suffix: int = 0
-) -> BlockArray:
+) -> StoredArray:
     """Describe flat binary data: a header, then numbers with the last dimension contiguous.
 
     Args:
@@ -209,7 +171,7 @@ def flat_array(
         mapped = np.memmap(path, np.uint8, "r", header)
         return np.array(np.ndarray(shape, dtype, mapped, prefix, (line, *inner[1:]))[slices])  # pyright: ignore[reportCallIssue, reportArgumentType]
 
-    return BlockArray(path, "flat binary data", "", shape, dtype, part)
+    return StoredArray(str(path), shape, dtype, part)
 
 
 def _hdf5(path: Path, stack: ExitStack, matlab: bool) -> Container:

@@ -82,7 +82,7 @@ def read_array(file: str | Path, key: str | None = None) -> np.ndarray:
                 return np.asarray(grey, np.float64)[::-1].copy()
         if held.kind == "table" and key is None:
             return np.stack(list(read_table(path).values()), -1)
-        return held.array(key).read()
+        return held.array(key).load()
 
 
 def read_points(

@@ -300,10 +300,10 @@ class _Scene:
 
         At the centre point the polynomial has the value `at_centre`.
         """
-        place, power = torch.stack([self.row_m, self.column_m]).numpy(), np.arange(_ORDER + 1)
-        scale, total = max(np.abs(place).max(), 1e-9), power[:, None] + power
+        row, column, power = self.row_m.numpy(), self.column_m.numpy(), np.arange(_ORDER + 1)
+        scale, total = max(np.abs(row).max(), np.abs(column).max(), 1e-9), power[:, None] + power
         used = (total > 0) & (total <= _ORDER)
-        terms = np.polynomial.polynomial.polyvander2d(*place / scale, (_ORDER, _ORDER))[:, used.ravel()]
+        terms = np.polynomial.polynomial.polyvander2d(row / scale, column / scale, (_ORDER, _ORDER))[:, used.ravel()]
         poly = np.zeros(total.shape)
         poly[used] = np.linalg.lstsq(terms, values.numpy() - at_centre, rcond=None)[0]
         poly[0, 0] = at_centre

@@ -7,7 +7,6 @@ of the radar are. The result is an archive (.npz) for `read_stripmap`, `read_inv
 
 from __future__ import annotations
 
-import io
 import math
 import re
 import shutil
@@ -16,13 +15,13 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import cache, partial
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
 from torchsar.core import Recording, StoredArray
-from torchsar.io.containers import BlockArray, Container, flat_array, open_container
+from torchsar.io.containers import Container, flat_array, open_container
 from torchsar.io.extras import write_whole
 from torchsar.io.fields import Described, Level, complex_type, joined, naming, parted
 from torchsar.io.history import describe_inverse, describe_path
@@ -185,7 +184,7 @@ def import_recording(path: str | Path, sidecar: Mapping[str, Any], out: str | Pa
 
     All keys are checked before samples are read. Samples are read and written in blocks of 32 MiB
     (or of one line, if it is longer): less than 256 MiB and the side arrays are in memory at a
-    time. Only from a MATLAB 5 or a numpy file all samples are read at once.
+    time. Only from a MATLAB 5 or a compressed numpy file all samples are read at once.
 
     Args:
         path: Path of the data.
@@ -228,8 +227,8 @@ def import_recording(path: str | Path, sidecar: Mapping[str, Any], out: str | Pa
                 unit, along = known[one]
                 x = _value(file, value, f"{where}.{one}", unit, lengths.get(along))
                 arrays[one] = x = x.reshape(()) if section == "radar" and x.size == 1 else x
-                stored[one] = StoredArray(f"{where}.{one}", x.shape, x.dtype, partial(_stream, x))
-        stored[key] = StoredArray(f"{name}: samples", shape, samples.dtype, partial(_stream, np.zeros(())))
+                stored[one] = StoredArray(f"{where}.{one}", x.shape, x.dtype, x.__getitem__)
+        stored[key] = StoredArray(f"{name}: samples", shape, samples.dtype, samples.part)
         found = kind.describe(stored, Path(name))
         # adds the name of the sidecar to errors of side data that are only checked when a recording
         # is made
@@ -251,7 +250,7 @@ class _File(NamedTuple):
     opened: Callable[[Path], Container | None]
 
 
-def _samples(file: _File, tree: Mapping[str, Any], where: str, order: tuple[str, str]) -> tuple[BlockArray, str, bool]:
+def _samples(file: _File, tree: Mapping[str, Any], where: str, order: tuple[str, str]) -> tuple[StoredArray, str, bool]:
     """Combine the sample arrays in the file into one complex array in the order of the file.
 
     Returns the array, the name of its slow dim, which is its first one, and whether the stored
@@ -295,7 +294,7 @@ def _samples(file: _File, tree: Mapping[str, Any], where: str, order: tuple[str,
         )
     slow = next(one for one in dims if one in order)
     turn, offset = _order(tree, where, dims, shape, slow), _offset(tree, where)
-    table = None if "table" not in tree else _array(file, file.path, {"name": tree["table"]}, where).read().ravel()
+    table = None if "table" not in tree else _array(file, file.path, {"name": tree["table"]}, where).load().ravel()
     if table is not None and not kinds <= {"i", "u"}:
         raise ValueError(f"{where}.table: samples must be whole numbers, indices of it, got {parts[0].dtype.name}")
 
@@ -315,7 +314,7 @@ def _samples(file: _File, tree: Mapping[str, Any], where: str, order: tuple[str,
     types = (part.dtype if table is None else table.dtype for part in parts)
     lengths = tuple(shape[one] for one in dims if one in order)
     dtype = complex_type(np.result_type(*types))
-    found = BlockArray(parts[0].path, parts[0].kind, parts[0].name, lengths, dtype, complex_part)
+    found = StoredArray(parts[0].what, lengths, dtype, complex_part)
     return found, slow, kinds == {"u"}
 
 
@@ -345,7 +344,7 @@ def _offset(tree: Mapping[str, Any], where: str) -> complex:
     return complex(*both)
 
 
-def _array(file: _File, path: Path, tree: Mapping[str, Any], where: str) -> BlockArray:
+def _array(file: _File, path: Path, tree: Mapping[str, Any], where: str) -> StoredArray:
     """Find the array that `name` or the layout of a flat binary file describes."""
     container = file.opened(path)
     flat = [key for key in _FLAT if key in tree]
@@ -385,7 +384,7 @@ def _value(file: _File, value: Any, where: str, own: str, n: int | None) -> np.n
         steps = {"first", "step"} & set(value)
         tree = _section(value, where, _ENTRY, ("first", "step") if steps else ())
         unit, path = tree.get("unit"), file.path.parent / tree["file"] if "file" in tree else file.path
-        array = _steps(tree, where, n) if steps else _array(file, path, tree, where).read()
+        array = _steps(tree, where, n) if steps else _array(file, path, tree, where).load()
         array = array.T if tree.get("transpose", False) else array
     else:
         array = _numbers(value, where, own)
@@ -461,18 +460,10 @@ def _choice(value: Any, where: str, accepted: Sequence[str] | Mapping[str, Any])
     return value
 
 
-def _stream(array: np.ndarray) -> IO[bytes]:
-    """Write an array to a file in memory in the format .npy."""
-    stream = io.BytesIO()
-    np.save(stream, array, allow_pickle=False)
-    stream.seek(0)
-    return stream
-
-
 def _write(
     path: Path,
     key: str,
-    samples: BlockArray,
+    samples: StoredArray,
     slow: str,
     turned: bool,
     arrays: Mapping[str, np.ndarray],
