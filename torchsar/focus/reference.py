@@ -108,6 +108,12 @@ class RangeCompress(Stage):
     Samples closer to the end of a line than one pulse length are compressed with the recorded part
     of their echo.
 
+    The response of a pulse of duration T and bandwidth B ends in side lobes at a distance of one
+    pulse length, which look like a pair of faint ghosts of a bright point. With "matched" they lie
+    about 1 / (pi T B) below the peak, -48 dB for T B = 80. Sampling at 1.25 B lets the frequencies
+    of the abrupt ends of the pulse alias, which raises them to -39 dB; at 2 B they are at -46 dB.
+    "flat" and "phase" make them 3 to 10 dB stronger. Longer pulses lower them: -51 dB for T B = 320.
+
     Args:
         radar: Radar of the recording.
         reference: Spectrum of the filter: "matched" for the conjugate pulse spectrum, "flat" for
