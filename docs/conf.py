@@ -21,6 +21,7 @@ extensions = [
     "api",  # pages of the public names, and docstrings as reStructuredText
     "mathml",  # formulas without scripts
     "offline",  # nothing is loaded from a network
+    "tutorials",  # each tutorial as a notebook for download
     "records",  # figures and tables from docs/sweeps, docs/trade, docs/requires and docs/reproduce
 ]
 exclude_patterns = ["_build", "sweeps", "trade", "requires", "reproduce"]

@@ -34,4 +34,5 @@ def test_a_notebook_holds_the_page_and_what_it_prints(name: str, tmp_path: Path)
     assert all(cell.execution_count for cell in code) and any(cell.outputs for cell in code)
     text = "".join(cell.source for cell in made.cells if cell.cell_type == "markdown")
     assert made.cells[0].source.startswith("# ") and "{py:" not in text and "```{" not in text
-    assert all((tmp_path / picture).is_file() for picture in re.findall(r"!\[[^\]]*\]\(([^)]*)\)", text))
+    held = [picture for cell in made.cells for picture in cell.get("attachments", {})]
+    assert held and sorted(re.findall(r"!\[[^\]]*\]\(([^)]*)\)", text)) == sorted(f"attachment:{one}" for one in held)

@@ -112,7 +112,8 @@ class RangeCompress(Stage):
     pulse length, which look like a pair of faint ghosts of a bright point. With "matched" they lie
     about 1 / (pi T B) below the peak, -48 dB for T B = 80. Sampling at 1.25 B lets the frequencies
     of the abrupt ends of the pulse alias, which raises them to -39 dB; at 2 B they are at -46 dB.
-    "flat" and "phase" make them 3 to 10 dB stronger. Longer pulses lower them: -51 dB for T B = 320.
+    "flat" and "phase" make them 3 to 10 dB stronger. Longer pulses lower them: -51 dB for T B of
+    320.
 
     Args:
         radar: Radar of the recording.
