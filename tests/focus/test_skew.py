@@ -63,7 +63,7 @@ def test_each_sample_of_the_spectrum_is_used_once_at_its_own_doppler(factor):
     centre = torch.tensor([DOPPLER_HZ, -170.0], dtype=torch.float64)
     geometry = FrameGeometry.of(L_BAND, raw, centre, None, 0.0)
     skew = replace(DopplerSkew.of(L_BAND, raw, centre, geometry.velocity_m_s, 20.0), band_hz=None, factor=factor)
-    image = through_skewed_doppler(raw, lambda rows, at: rows, geometry, skew)
+    image = through_skewed_doppler(raw, lambda rows: rows, lambda at: (), geometry, skew)
     torch.testing.assert_close(image[..., ::factor, :], torch.fft.fft(raw), rtol=0, atol=1e-10)
     fine = torch.fft.fft(image, dim=-2)
     occupied = fine.abs() > 1e-9

@@ -268,12 +268,6 @@ FUNCTIONS = [
     _entry("core.centred_ifft", "raw", core.centred_ifft, laws=Laws(range=NEW_AXIS, energy=1 / 64)),
     _entry("core.fft_lines", "raw", core.fft_lines, laws=Laws(pulse=NEW_AXIS, energy=48)),
     _entry(
-        "core.spectrum_in_blocks",
-        "raw",
-        core.spectrum_in_blocks,
-        laws=Laws(pulse=NEW_AXIS, range=NEW_AXIS, energy=48 * 64),
-    ),
-    _entry(
         "core.transform_in_blocks",
         "raw",
         lambda x: core.transform_in_blocks(x.clone(), -2),

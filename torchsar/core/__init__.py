@@ -43,7 +43,6 @@ from torchsar.core.fft import (
     from_frequency,
     is_plain,
     over_blocks,
-    spectrum_in_blocks,
     to_frequency,
     transform_in_blocks,
 )

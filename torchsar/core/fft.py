@@ -270,35 +270,6 @@ def transform_in_blocks(
     return out
 
 
-def spectrum_in_blocks(x: Tensor) -> Tensor:
-    """Compute the two-dimensional FFT in blocks that stay in the cache.
-
-    A trial that fits the cache is transformed by one two-dimensional FFT, a larger one along the
-    range first and then along the pulses, in blocks. Not differentiable.
-
-    Args:
-        x: Samples, shape (..., pulse, range), complex.
-
-    Returns:
-        Spectrum in FFT order, a new array of the same shape.
-
-    Raises:
-        TypeError: If the samples are not complex64 or complex128.
-        ValueError: If there are no samples.
-    """
-    x = checked_samples(x, "spectrum_in_blocks", "pulse, range", finite=False)
-    out = torch.empty_like(x, memory_format=torch.contiguous_format)
-    if x.shape[-2] * x.shape[-1] * x.element_size() > 4 * block_bytes_of(x.device):
-        return transform_in_blocks(transform_in_blocks(x, -1, out=out), -2)
-    source, target = x.reshape(-1, *x.shape[-2:]), out.view(-1, *x.shape[-2:])
-
-    def work(trial: int) -> None:
-        target[trial] = torch.fft.fft2(source[trial])
-
-    over_blocks(work, range(source.shape[0]), out)
-    return out
-
-
 def _blocks(x: Tensor, dim: int, block_bytes: int) -> Iterator[tuple[slice, ...]]:
     """Slices of an array, one for each block that is transformed at once.
 

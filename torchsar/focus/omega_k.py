@@ -35,11 +35,12 @@ from torchsar.core import (
     host_largest,
     is_traced,
     linear_phasor,
+    outer_phasor,
     over_blocks,
     per_trial,
+    phasor_tables,
     real_dtype,
     reduced_turns,
-    spectrum_in_blocks,
     transform_in_blocks,
     unit_phasor,
 )
@@ -131,43 +132,82 @@ class FrequencyBasis:
         u = (radar.range_frequency_hz(n, device) / (radar.sampling_hz / 2)).clamp(-1, 1)
         self._polynomials = torch.cos(torch.acos(u) * order[:, None])
 
-    def evaluate(self, values_at_nodes: Tensor, dtype: torch.dtype) -> Tensor:
-        """Interpolate a smooth real function of range frequency from the nodes to the FFT grid.
+    def table(self, values_at_nodes: Tensor) -> Tensor:
+        """Compute the small table from which `evaluate` interpolates a smooth real function.
 
         Args:
             values_at_nodes: Values at the frequencies `nodes_hz`, shape (..., row, node), float64.
+
+        Returns:
+            Table, shape (..., row, node), float64.
+        """
+        return values_at_nodes if self.direct else values_at_nodes @ self._to_coefficients
+
+    def evaluate(self, table: Tensor, dtype: torch.dtype) -> Tensor:
+        """Interpolate a smooth real function of range frequency from the nodes to the FFT grid.
+
+        Args:
+            table: Rows of the result of `table`, shape (..., row, node).
             dtype: Real type of the result.
 
         Returns:
             Values at all range frequencies in FFT order, shape (..., row, n).
         """
-        if self.direct:
-            return values_at_nodes.to(dtype)
-        return (values_at_nodes @ self._to_coefficients).to(dtype) @ self._polynomials.to(dtype)
+        return table.to(dtype) if self.direct else table.to(dtype) @ self._polynomials.to(dtype)
 
-    def phasor(self, turns_at_nodes: Tensor, dtype: torch.dtype) -> Tensor:
-        """Interpolate a phase from the nodes to the FFT grid, and return exp(2j pi phase).
+    def turn_table(self, turns_at_nodes: Tensor, dtype: torch.dtype) -> Tensor:
+        """Compute the small table from which `phasors` evaluates a phase.
 
         Args:
             turns_at_nodes: Phase in turns at the frequencies `nodes_hz`, shape (..., row, node),
                 float64.
+            dtype: Complex type of the phasors.
+
+        Returns:
+            Table, shape (..., row, node): in radians in the precision of the phasors if that
+            suffices, else in turns in float64.
+        """
+        if self.direct:
+            return turns_at_nodes
+        coefficients = self.table(turns_at_nodes)
+        constant = reduced_turns(coefficients[..., :1])
+        varying = coefficients[..., 1:].abs().sum(-1)
+        table = torch.cat([constant, coefficients[..., 1:]], -1)
+        # Measured for white noise in float32: the image error is -95 dB if the phase varies by 166
+        # cycles, and -87 dB at 339.
+        if dtype == torch.complex64 and not ((self._wait or varying.device.type == "cpu") and is_below(varying, 200)):
+            return table
+        return (2 * math.pi * table).to(real_dtype(dtype))
+
+    def phasors(self, table: Tensor, dtype: torch.dtype) -> Tensor:
+        """Interpolate a phase to the FFT grid, and return its phasors.
+
+        Args:
+            table: Rows of the result of `turn_table`, shape (..., row, node).
             dtype: Complex type of the result.
 
         Returns:
             Phasors at all range frequencies in FFT order, shape (..., row, n).
         """
         if self.direct:
-            return unit_phasor(turns_at_nodes, dtype)
-        coefficients = turns_at_nodes @ self._to_coefficients
-        constant = reduced_turns(coefficients[..., :1])
-        varying = coefficients[..., 1:].abs().sum(-1)
-        # Measured for white noise in float32: the image error is -95 dB if the phase varies by 166
-        # cycles, and -87 dB at 339.
-        if dtype == torch.complex64 and not ((self._wait or varying.device.type == "cpu") and is_below(varying, 200)):
-            turns = constant + coefficients[..., 1:] @ self._polynomials[1:]
-            return unit_phasor(turns, dtype)
-        coefficients = torch.cat([constant, coefficients[..., 1:]], -1).to(real_dtype(dtype))
-        return cis(2 * math.pi * (coefficients @ self._polynomials.to(coefficients.dtype)))
+            return unit_phasor(table, dtype)
+        values = table @ self._polynomials.to(table.dtype)
+        return cis(values) if table.dtype == real_dtype(dtype) else unit_phasor(values, dtype)
+
+
+def bulk_turns(basis: FrequencyBasis, at: FrameGeometry, range_m: Tensor | float) -> Tensor:
+    """Compute the phase of `bulk_filter` at the nodes of range frequency.
+
+    Args:
+        basis: Polynomials that interpolate phases over the range band.
+        at: Geometry of the Doppler rows.
+        range_m: Slant range in metres.
+
+    Returns:
+        Turns, shape (..., d, node), float64.
+    """
+    delay = 2 * range_m / at.radar.wave_speed_m_s
+    return delay * (at.mapped(basis.nodes_hz) - basis.nodes_hz) + STATIONARY_TURNS
 
 
 def bulk_filter(
@@ -191,8 +231,7 @@ def bulk_filter(
     Returns:
         Filter, shape (..., d, n), for d Doppler rows and n range frequencies.
     """
-    turns = (2 * range_m / at.radar.wave_speed_m_s) * (at.mapped(basis.nodes_hz) - basis.nodes_hz) + STATIONARY_TURNS
-    h = basis.phasor(turns, dtype)
+    h = basis.phasors(basis.turn_table(bulk_turns(basis, at, range_m), dtype), dtype)
     return h if reference is None else h * reference.to(dtype)
 
 
@@ -227,6 +266,48 @@ def refocus(rows: Tensor, turns_per_sample: Tensor, centre: int) -> Tensor:
         Focused azimuth spectra, same shape.
     """
     return rows * linear_phasor(turns_per_sample, -centre, rows.shape[-1], rows.dtype)
+
+
+def row_tables(
+    basis: FrequencyBasis, at: FrameGeometry, range_m: Tensor | float, raw: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Compute small tables, from which the filters of Doppler rows are formed in blocks.
+
+    Args:
+        basis: Polynomials that interpolate phases over the range band.
+        at: Geometry of the Doppler rows.
+        range_m: Slant range in metres of the middle sample.
+        raw: Data that give the number of range samples and the dtype.
+
+    Returns:
+        Table of the bulk filter for `FrequencyBasis.phasors`, and the two of the phasors of
+        refocusing for `outer_phasor`, each of shape (..., d, m).
+    """
+    n = raw.shape[-1]
+    return (
+        basis.turn_table(bulk_turns(basis, at, range_m), raw.dtype),
+        *phasor_tables(refocus_turns_per_sample(at), -(n // 2), n, raw.dtype),
+    )
+
+
+def tabulated(
+    build: Callable[[FrameGeometry], tuple[Tensor, ...]], geometry: FrameGeometry, once: bool = True
+) -> Callable[[slice], tuple[Tensor, ...]]:
+    """Return a function that gives the tables of some Doppler rows.
+
+    Args:
+        build: Computes tables (..., d, m) of the rows of a geometry.
+        geometry: Geometry of all Doppler rows.
+        once: Compute those of all rows at once. Where False, they are computed for each request,
+            which saves memory where tables are as large as the data.
+
+    Returns:
+        Function of a slice of the Doppler axis.
+    """
+    if not once:
+        return lambda part: build(geometry.rows(part))
+    tables = build(geometry)
+    return lambda part: tuple(table[..., part, :] for table in tables)
 
 
 def omega_k(
@@ -277,14 +358,19 @@ def omega_k(
     """
     raw = checked_samples(raw, "omega_k", "pulse, range", finite=False)
     geometry = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz, band_hz=band_hz)
-    n, centre = raw.shape[-1], raw.shape[-1] // 2
+    n = raw.shape[-1]
     basis = FrequencyBasis(radar, n, raw.device, geometry.sin_reach)
-    range_m = radar.near_range_m + centre * radar.range_step_m
+    range_m = radar.near_range_m + n // 2 * radar.range_step_m
+
+    tables = tabulated(lambda at: row_tables(basis, at, range_m, raw), geometry, not basis.direct)
+    reference = None if reference is None else reference.to(raw.dtype)
 
     def focus_rows(rows: Tensor, part: slice) -> Tensor:
-        at = geometry.rows(part)
-        rows = rows * bulk_filter(basis, at, range_m, reference, raw.dtype)
-        return at.weighted(refocus(torch.fft.ifft(rows), refocus_turns_per_sample(at), centre))
+        bulk, fine, coarse = tables(part)
+        if reference is not None:
+            rows = rows * reference
+        lines = torch.fft.ifft(rows * basis.phasors(bulk, raw.dtype))
+        return geometry.rows(part).weighted(lines * outer_phasor(fine, coarse, n))
 
     return through_doppler(raw, focus_rows, differentiable=geometry.requires_grad or raw.requires_grad)
 
@@ -322,12 +408,13 @@ def through_doppler(
     """
     if is_whole(raw, differentiable):
         return torch.fft.ifft(focus_rows(torch.fft.fft2(raw), slice(None)), dim=-2)
-    work = spectrum_in_blocks(raw)
+    # the range FFT of a block of rows shares its stay in the cache with their focusing
+    work = transform_in_blocks(raw, -2, out=torch.empty_like(raw, memory_format=torch.contiguous_format))
     block_bytes = block_bytes_of(raw.device) if block_bytes is None else block_bytes
     height = max(1, block_bytes // max(1, work[..., 0, :].numel() * work.element_size()))
 
     def focus(part: slice) -> None:
-        work[..., part, :] = focus_rows(work[..., part, :], part)
+        work[..., part, :] = focus_rows(torch.fft.fft(work[..., part, :]), part)
 
     over_blocks(focus, (slice(first, first + height) for first in range(0, work.shape[-2], height)), work)
     return transform_in_blocks(work, -2, inverse=True)

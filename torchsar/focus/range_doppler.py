@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import torch
@@ -12,14 +13,16 @@ from torchsar.core import (
     Stage,
     checked_samples,
     from_frequency,
-    linear_phasor,
+    host_largest,
+    outer_phasor,
+    phasor_tables,
     real_dtype,
     to_frequency,
     unit_phasor,
 )
-from torchsar.core.nufft import Nufft, Points
+from torchsar.core.nufft import Nufft
 from torchsar.focus.frame_geometry import FrameGeometry
-from torchsar.focus.omega_k import STATIONARY_TURNS, Focuser, refocus_turns_per_sample, through_doppler
+from torchsar.focus.omega_k import STATIONARY_TURNS, Focuser, refocus_turns_per_sample, tabulated, through_doppler
 from torchsar.radar import StripmapRadar
 
 
@@ -89,36 +92,51 @@ def range_doppler(
     geometry = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz, band_hz=band_hz)
     n = raw.shape[-1]
     plan = Nufft(n, eps, raw.dtype, raw.device)
+    reference = None if reference is None else reference.to(raw.dtype)
+    align = tabulated(lambda at: _alignment(at, raw), geometry)
+    compress = tabulated(lambda at: _compression(at, raw, n), geometry)
 
     def focus_rows(rows: Tensor, part: slice) -> Tensor:
-        at = geometry.rows(part)
-        spectrum = rows if reference is None else rows * reference.to(rows.dtype)
-        return _compressed(_aligned(spectrum, at, plan), at, n)
+        spectrum = rows if reference is None else rows * reference
+        lines = _aligned(spectrum, plan, *align(part))
+        return geometry.rows(part).weighted(_compressed(lines, *compress(part)))
 
     return through_doppler(raw, focus_rows, differentiable=geometry.requires_grad or raw.requires_grad)
 
 
-def _aligned(spectrum: Tensor, at: FrameGeometry, plan: Nufft) -> Tensor:
+def _alignment(at: FrameGeometry, raw: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Tables of `_aligned`: relative migration of each row, and two of the phasors of its shift."""
+    n, near = raw.shape[-1], at.radar.near_range_m / at.radar.range_step_m
+    turns = migration(at) * ((n // 2 + near) / n)
+    return (migration(at)[..., None], *phasor_tables(turns, -(n // 2), n, raw.dtype))
+
+
+def _aligned(spectrum: Tensor, plan: Nufft, relative: Tensor, fine: Tensor, coarse: Tensor) -> Tensor:
     """Lines (..., d, range) without range migration, times their number of samples, from their
     spectra over range frequency.
     """
-    n, near = spectrum.shape[-1], at.radar.near_range_m / at.radar.range_step_m
-    cell = torch.arange(n, dtype=torch.float64, device=spectrum.device)
-    centre_cells, per_sample = n // 2 + near, plan.length / n
-    # Cell i of the image lies at cell i + (i + near) * migration of the row. The exponent is
-    # +2j pi k q / n, so that points have the opposite sign.
-    start = migration(at) * centre_cells
-    shift = start[..., None] + migration(at)[..., None] * ((cell + near) - centre_cells)
-    points = Points.of(plan.kernel, -per_sample * cell, plan.length, real_dtype(spectrum.dtype), -per_sample * shift)
-    return plan.type2(torch.fft.fftshift(spectrum, dim=-1), points)
+    n = spectrum.shape[-1]
+    # Cell i of the image lies at cell i + (i + near) * migration of the row.
+    single = spectrum.dtype == torch.complex64
+    reach = n / 2 * host_largest(relative.detach().abs(), math.inf) if single else math.inf
+    real = real_dtype(spectrum.dtype) if reach < 100 else torch.float64
+    cell = torch.arange(n, dtype=real, device=spectrum.device) - n // 2
+    shifted = spectrum * torch.fft.ifftshift(outer_phasor(fine, coarse, n), dim=-1)
+    return plan.shift_samples(shifted, relative.to(real) * cell, reach)
 
 
-def _compressed(lines: Tensor, at: FrameGeometry, scale: int = 1) -> Tensor:
-    """Lines (..., d, range) times the azimuth filter of each range, over a number."""
-    n, near = lines.shape[-1], at.radar.near_range_m / at.radar.range_step_m
+def _compression(at: FrameGeometry, raw: Tensor, scale: int = 1) -> tuple[Tensor, Tensor]:
+    """Tables of `_compressed`, whose product is the azimuth filter of each row over a number."""
+    n, near = raw.shape[-1], at.radar.near_range_m / at.radar.range_step_m
     turns = refocus_turns_per_sample(at)
-    constant = unit_phasor(turns * (n // 2 + near) + STATIONARY_TURNS, lines.dtype) / scale
-    return at.weighted(lines * linear_phasor(turns, -(n // 2), n, lines.dtype) * constant[..., None])
+    fine, coarse = phasor_tables(turns, -(n // 2), n, raw.dtype)
+    constant = unit_phasor(turns * (n // 2 + near) + STATIONARY_TURNS, raw.dtype)
+    return fine, coarse * constant[..., None] / scale
+
+
+def _compressed(lines: Tensor, fine: Tensor, coarse: Tensor) -> Tensor:
+    """Lines (..., d, range) times the azimuth filter of each range."""
+    return lines * outer_phasor(fine, coarse, lines.shape[-1])
 
 
 class RangeDoppler(Focuser):
@@ -262,7 +280,7 @@ class CorrectRangeMigration(_DopplerStep):
     def _done(self, signal: Signal, at: FrameGeometry) -> Signal:
         n, data = signal.data.shape[-1], signal.data
         plan = Nufft(n, self.eps, data.dtype, data.device)
-        return signal.with_data(_aligned(torch.fft.fft(data), at, plan) / n)
+        return signal.with_data(_aligned(torch.fft.fft(data), plan, *_alignment(at, data)) / n)
 
 
 class AzimuthCompress(_DopplerStep):
@@ -289,5 +307,6 @@ class AzimuthCompress(_DopplerStep):
     """
 
     def _done(self, signal: Signal, at: FrameGeometry) -> Signal:
-        lines = from_frequency(signal.with_data(_compressed(signal.data, at)), "doppler")
+        data = at.weighted(_compressed(signal.data, *_compression(at, signal.data)))
+        lines = from_frequency(signal.with_data(data), "doppler")
         return Signal(lines.data, self.radar.image_axes(lines.axes))

@@ -24,12 +24,11 @@ from torchsar.core import (
     is_traced,
     over_blocks,
     real_dtype,
-    spectrum_in_blocks,
     transform_in_blocks,
     untraced,
 )
 from torchsar.focus.frame_geometry import BAND_EDGE, FrameGeometry, band_weight, raised_cosine_band
-from torchsar.focus.omega_k import is_whole, through_doppler
+from torchsar.focus.omega_k import is_whole, tabulated, through_doppler
 from torchsar.radar import StripmapRadar
 
 # Tolerated excess of the band of an image over its sampling rate, relative to this rate. The
@@ -295,7 +294,12 @@ def _refuse_aliased(radar: StripmapRadar, n_range: int, centre_hz: Tensor, veloc
 
 
 def through_skewed_doppler(
-    raw: Tensor, focus_rows: Callable[[Tensor, FrameGeometry], Tensor], geometry: FrameGeometry, skew: DopplerSkew
+    raw: Tensor,
+    focus_rows: Callable[..., Tensor],
+    build: Callable[[FrameGeometry], tuple[Tensor, ...]],
+    geometry: FrameGeometry,
+    skew: DopplerSkew,
+    once: bool = True,
 ) -> Tensor:
     """Apply a function to the rows of the unwrapped two-dimensional spectrum, then an azimuth FFT.
 
@@ -304,34 +308,38 @@ def through_skewed_doppler(
 
     Args:
         raw: Raw data, shape (..., pulse, range), complex.
-        focus_rows: Maps rows (..., d, range frequency) at the Doppler of a geometry to (..., d,
-            range).
+        focus_rows: Maps rows (..., d, range frequency) and their tables to (..., d, range).
+        build: Computes the tables (..., d, m) of the rows of a geometry.
         geometry: Geometry of all Doppler rows, at the centroid of the carrier.
         skew: Doppler centroid over range frequency.
+        once: Compute the tables of all rows at once, see `tabulated`.
 
     Returns:
         Image, shape (..., azimuth, range), with `skew.factor` lines per pulse.
     """
 
+    tables = tabulated(build, geometry, once)
+    even = skew.jumps(slice(None))[0] == []
+
     def parts(rows: Tensor, part: slice) -> Iterator[tuple[Tensor, int, list[int] | slice]]:
         """Generate parts of focused lines, the change of their number of PRFs, and their rows."""
-        at = geometry.rows(part)
         rows = skew.weighted(rows, part)
-        jumping, changes = skew.jumps(part)
+        jumping, changes = ([], range(1)) if even else skew.jumps(part)
         if jumping == []:
-            yield focus_rows(rows, at), 0, slice(None)
+            yield focus_rows(rows, *tables(part)), 0, slice(None)
             return
+        at = geometry.rows(part)
         some, change = rows[..., jumping, :], skew.changes(part, jumping)
         mine = (change == 0).to(real_dtype(rows.dtype))
         if jumping == slice(None):
             still = some * mine
         else:
             still = rows.index_copy(-2, torch.tensor(jumping, device=rows.device), some * mine)
-        yield focus_rows(still, at), 0, slice(None)
+        yield focus_rows(still, *tables(part)), 0, slice(None)
         for k in changes:
             if k:
                 there = replace(at, doppler_hz=at.doppler_hz[..., jumping] + k * skew.radar.prf_hz)
-                yield focus_rows(some * (change == k).to(mine.dtype), there), k, jumping
+                yield focus_rows(some * (change == k).to(mine.dtype), *build(there)), k, jumping
 
     def whole(rows: Tensor, part: slice) -> Tensor:
         """Sum of the parts, shape (..., d, range). For several lines per pulse it is (..., factor,
@@ -358,12 +366,12 @@ def through_skewed_doppler(
     if is_whole(raw, differentiable):
         spectrum = whole(torch.fft.fft2(raw), slice(None))
         return torch.fft.ifft(spectrum.flatten(-3, -2), dim=-2) * skew.factor
-    work = spectrum_in_blocks(raw)
+    work = transform_in_blocks(raw, -2, out=torch.empty_like(raw, memory_format=torch.contiguous_format))
     fine = work.new_empty((*work.shape[:-2], skew.factor, *work.shape[-2:]))
     height = max(1, block_bytes_of(raw.device) // max(1, work[..., 0, :].numel() * work.element_size()))
 
     def focus(part: slice) -> None:
-        fine[..., part, :] = whole(work[..., part, :], part)
+        fine[..., part, :] = whole(torch.fft.fft(work[..., part, :]), part)
 
     over_blocks(focus, (slice(first, first + height) for first in range(0, work.shape[-2], height)), work)
     return transform_in_blocks(fine.flatten(-3, -2), -2, inverse=True).mul_(skew.factor)

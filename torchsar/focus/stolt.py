@@ -2,68 +2,22 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
-from torchsar.core import checked_samples, real_dtype
-from torchsar.core.nufft import Nufft, Points
+from torchsar.core import checked_samples, host_largest, outer_phasor, real_dtype
+from torchsar.core.nufft import Nufft
 from torchsar.focus.frame_geometry import FrameGeometry
 from torchsar.focus.omega_k import (
     Focuser,
     FrequencyBasis,
-    bulk_filter,
-    is_below,
-    refocus,
-    refocus_turns_per_sample,
     residual_frequency,
+    row_tables,
 )
 from torchsar.focus.skew import DopplerSkew, through_skewed_doppler
 from torchsar.radar import StripmapRadar
-
-
-class StoltMap:
-    """Stolt interpolation of the range spectrum after the bulk filter.
-
-    It corrects the change of range migration and of range focus over the swath. The bulk filter and
-    `refocus` already perform most of the Stolt mapping; the remaining frequency shift is a fraction
-    of a frequency bin in most scenes. A non-uniform FFT evaluates the spectrum at the shifted
-    frequencies of every Doppler row, so that larger shifts are also handled.
-
-    Args:
-        basis: Polynomials that interpolate the shift over the range band.
-        radar: Radar of the recording.
-        n: Number of range samples.
-        eps: Relative error of the interpolation.
-        dtype: Complex type of the data.
-        device: Device of the data.
-    """
-
-    def __init__(
-        self,
-        basis: FrequencyBasis,
-        radar: StripmapRadar,
-        n: int,
-        eps: float,
-        dtype: torch.dtype,
-        device: torch.device | None = None,
-    ) -> None:
-        self.basis, self.plan = basis, Nufft(n, eps, dtype, device)
-        self.step_hz = radar.sampling_hz / self.plan.length
-        self.start = radar.range_frequency_hz(n, device) / self.step_hz
-
-    def __call__(self, lines: Tensor, at: FrameGeometry) -> Tensor:
-        """Apply the mapping to azimuth spectra (..., d, range) after the bulk filter and before
-        refocusing.
-        """
-        residual = residual_frequency(at, self.basis.nodes_hz) / self.step_hz
-        real = real_dtype(lines.dtype)
-        # Float32 suffices for small shifts, which are usual, and takes half the time. For shifts up
-        # to 200 grid points it keeps the error of the image below -80 dB.
-        near = real == torch.float64 or is_below(residual, 200)
-        shift = self.basis.evaluate(residual, real if near else torch.float64)
-        start, shift = (self.start, shift) if near else (self.start + shift, None)
-        points = Points.of(self.plan.kernel, start, self.plan.length, real, shift)
-        return torch.fft.fftshift(torch.fft.ifft(self.plan.type2(lines, points)), dim=-1)
 
 
 def omega_k_stolt(
@@ -128,16 +82,31 @@ def omega_k_stolt(
     raw = checked_samples(raw, "omega_k_stolt", "pulse, range", finite=False)
     geometry = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz)
     skew = DopplerSkew.of(radar, raw, doppler_hz, geometry.velocity_m_s, band_hz)
-    n, centre = raw.shape[-1], raw.shape[-1] // 2
+    n = raw.shape[-1]
     basis = FrequencyBasis(radar, n, raw.device, skew.sin_reach(geometry))
-    mapping = StoltMap(basis, radar, n, eps, raw.dtype, raw.device)
-    range_m = radar.near_range_m + centre * radar.range_step_m
+    plan, real = Nufft(n, eps, raw.dtype, raw.device), real_dtype(raw.dtype)
+    range_m = radar.near_range_m + n // 2 * radar.range_step_m
+    reference = None if reference is None else reference.to(raw.dtype)
 
-    def focus_rows(rows: Tensor, at: FrameGeometry) -> Tensor:
-        lines = torch.fft.ifft(rows * bulk_filter(basis, at, range_m, reference, raw.dtype))
-        return refocus(mapping(lines, at), refocus_turns_per_sample(at), centre)
+    def build(at: FrameGeometry) -> tuple[Tensor, ...]:
+        # The bulk filter and refocusing already perform most of the Stolt mapping; the remaining
+        # shift is a fraction of a frequency bin in most scenes.
+        bins = residual_frequency(at, basis.nodes_hz) * (n / radar.sampling_hz)
+        # the outermost nodes lie inside the band
+        reach = bins.detach().abs().amax(-1, True) / math.cos(math.pi / (2 * bins.shape[-1]))
+        return (*row_tables(basis, at, range_m, raw), basis.table(bins), reach)
 
-    return through_skewed_doppler(raw, focus_rows, geometry, skew)
+    def focus_rows(rows: Tensor, bulk: Tensor, fine: Tensor, coarse: Tensor, bins: Tensor, reach: Tensor) -> Tensor:
+        if reference is not None:
+            rows = rows * reference
+        lines = torch.fft.ifft(rows * basis.phasors(bulk, raw.dtype))
+        largest = math.inf if raw.dtype == torch.complex128 else host_largest(reach, math.inf)
+        # Float32 suffices for small shifts, which are usual, and takes half the time. For shifts up
+        # to 100 bins it keeps the error of the image below -80 dB.
+        shift = basis.evaluate(bins, real if largest < 100 else torch.float64)
+        return plan.shift_spectrum(lines, shift, largest) * outer_phasor(fine, coarse, n)
+
+    return through_skewed_doppler(raw, focus_rows, build, geometry, skew, not basis.direct)
 
 
 class OmegaKStolt(Focuser):
