@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import pytest
 import torch
 
-from torchsar.study.bench import records
-from torchsar.study.bench.records import HERE, PLACES, VERSION, bench, checksum, frozen
+from tests.bench.frozen import fingerprint, frozen, table
+from torchsar.study.bench.records import PLACES, VERSION, bench, checksum
 
 # checksum of each benchmark in each version: a changed scene or score needs another version
 VERSIONS = {
@@ -42,19 +41,19 @@ NAMES = [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name fo
 
 def test_the_version_has_the_checksums_that_were_published() -> None:
     assert {name: checksum(name) for name in PLACES} == VERSIONS[VERSION], (
-        "scenes or scores have changed: give records.VERSION another name, and make the records again"
+        "scenes or scores have changed: give records.VERSION another name, make the records again, and write the table "
+        "by `python -m tests.bench.frozen BENCH`"
     )
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_scenes_and_scores_are_those_of_the_version(name: str) -> None:
-    table = json.loads((HERE / "frozen.json").read_text(encoding="utf-8"))[name]
-    found = frozen(bench(name))
-    assert set(found["worlds"]) == set(table["worlds"])
+    kept, found = table()[name], frozen(bench(name))
+    assert set(found["worlds"]) == set(kept["worlds"])
     for world, numbers in found["worlds"].items():
-        assert near(numbers, table["worlds"][world]), (world, numbers, table["worlds"][world])
-    assert set(found["score"]) == set(table["score"])
-    assert all(near(value, table["score"][key]) for key, value in found["score"].items()), found["score"]
+        assert near(numbers, kept["worlds"][world]), (world, numbers, kept["worlds"][world])
+    assert set(found["score"]) == set(kept["score"])
+    assert all(near(value, kept["score"][key]) for key, value in found["score"].items()), found["score"]
 
 
 def near(found: Any, recorded: Any) -> bool:
@@ -67,5 +66,5 @@ def near(found: Any, recorded: Any) -> bool:
 def test_a_changed_scene_changes_the_fingerprint() -> None:
     world = next(w for w in bench("autofocus").entries()[0].worlds if w.label == "direct, 10 dB")
     x = world.blocks(1)[0].data.data
-    assert not near(records.fingerprint(x), records.fingerprint(x + 0.02 * x.abs().mean() * torch.randn(x.shape)))
-    assert not near(records.fingerprint(x), records.fingerprint(x.flip(-1)))
+    assert not near(fingerprint(x), fingerprint(x + 0.02 * x.abs().mean() * torch.randn(x.shape)))
+    assert not near(fingerprint(x), fingerprint(x.flip(-1)))

@@ -26,24 +26,15 @@ from torchsar.scene import (
     TaylorRange,
 )
 from torchsar.scene.movers import Movers, MovingScene
+from torchsar.study.bench.direct.moving import published_radar
 
 C = 3e8
 SPEED, NEAR = 300.0, 5000.0
 
 
 def radar_of(**changes) -> BistaticRadar:
-    values: dict = {
-        "carrier_hz": 1.25e9,
-        "pulse": LinearFM(50e6, 2e-6),
-        "sampling_hz": 60e6,
-        "prf_hz": 180.0,
-        "speed_m_s": SPEED,
-        "reference_range_m": NEAR,
-        "channel_m": (-0.8, 0.1, 0.75),
-        "transmit_range": (-243.0, 0.02),
-        "wave_speed_m_s": C,
-    }
-    return BistaticRadar(**{**values, **changes})
+    values: dict = {"pulse": LinearFM(50e6, 2e-6), "channel_m": (-0.8, 0.1, 0.75), "transmit_range": (-243.0, 0.02)}
+    return published_radar(**{**values, **changes})
 
 
 RADAR = radar_of()

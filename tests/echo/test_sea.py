@@ -13,24 +13,16 @@ from torch import Tensor
 from torchsar.core import Draws
 from torchsar.echo import simulate_bistatic
 from torchsar.echo.sea import _Light, _Lines, sea_echo
-from torchsar.radar import LIGHT_M_S, BistaticRadar, LinearFM
+from torchsar.radar import LIGHT_M_S, BistaticRadar
 from torchsar.radar.bistatic import receive_range
 from torchsar.scene import BandLimited, BistaticWorld, ImageReflectivity, KSea, Pattern
 from torchsar.scene.sea import Sea
+from torchsar.study.bench.direct.moving import published_radar
 
 
 def geo_radar(**changes: Any) -> BistaticRadar:
     """The receiver of Remote Sens. 2020, 12, 1703, with a transmit range that a sea lacks."""
-    values: dict = {
-        "carrier_hz": 1.25e9,
-        "pulse": LinearFM(50e6, 10e-6),
-        "sampling_hz": 60e6,
-        "prf_hz": 180.0,
-        "speed_m_s": 300.0,
-        "reference_range_m": 5000.0,
-        "transmit_range": (-243.0, 0.03),
-    }
-    return BistaticRadar(**{**values, **changes})
+    return published_radar(**{"transmit_range": (-243.0, 0.03), "wave_speed_m_s": LIGHT_M_S, **changes})
 
 
 @dataclass(frozen=True)

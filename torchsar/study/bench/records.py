@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import importlib
 import json
-import math
 import platform
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -13,12 +12,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 import torchsar
-from torchsar.core import Estimate, Outcome
 from torchsar.study.bench.entrant import entrant, loaded
-from torchsar.study.bench.frame import BLOCK, Batch, Bench, Entry, counted, in_worlds_of, row, samples, scored
+from torchsar.study.bench.frame import BLOCK, Bench, Entry, in_worlds_of, scored
 from torchsar.study.settings.errors import ConfigError
 
 VERSION = "2026.2"
@@ -44,51 +41,6 @@ def bench(name: str) -> Bench:
         raise ConfigError(f"there is no benchmark {name!r}; choose one of {', '.join(PLACES)}")
     module, _, place = PLACES[name].partition(":")
     return getattr(importlib.import_module(f"torchsar.study.bench.{module}"), place)
-
-
-def fingerprint(x: Tensor) -> list[float]:
-    """Three numbers of samples: their rms, and a projection on fixed phasors relative to it."""
-    flat = x.detach().to(torch.complex128).reshape(-1)
-    flat = torch.where(torch.isfinite(flat.abs()), flat, 0)
-    k = torch.arange(len(flat), dtype=torch.float64)
-    norm = float(torch.linalg.vector_norm(flat))
-    part = complex((flat * torch.polar(torch.ones_like(k), 1.618 * k.square() % (2 * math.pi))).sum())
-    three = norm / max(1, len(flat)) ** 0.5, part.real / (norm or 1), part.imag / (norm or 1)
-    return [float(f"{y:.6g}") for y in three]
-
-
-def frozen(one: Bench) -> dict[str, Any]:
-    """What the version of a benchmark fixes: first data and truth of each world, and a score."""
-    found: dict[str, Any] = {}
-    seen: set[int] = set()
-    for entry in one.entries():
-        for world in entry.worlds:
-            if id(world) in seen:
-                continue
-            seen.add(id(world))
-            batch = world.blocks(1)[0]
-            truth = [fingerprint(x) for _, x in sorted((batch.truth or {}).items())]
-            label = f"{entry.name}: {world.label}" if world.label in found else world.label
-            found[label] = [fingerprint(samples(batch.data)), *truth]
-    return {"worlds": found, "score": _example(one)}
-
-
-def _example(one: Bench) -> dict[str, Any]:
-    """Scores of an estimate near the truth, sure in every second trial."""
-    entry = one.entries()[0]
-    for world in entry.worlds:
-        batch: Batch = world.blocks(4)[0]
-        if batch.truth is not None:
-            break
-    value, std = {}, {}
-    for quantity in (q for q in entry.judged if q.name in (batch.truth or {})):
-        truth = (batch.truth or {})[quantity.name].double().nan_to_num()
-        wave = torch.cos(torch.arange(truth.numel(), dtype=torch.float64).square()).reshape(truth.shape)
-        value[quantity.name] = truth + 0.7 * quantity.tolerance * wave
-        std[quantity.name] = torch.full_like(truth, 0.5 * quantity.tolerance)
-    ok = torch.arange(4) % 2 == 0
-    found = Estimate(value, std, outcome=Outcome.of(ok, Outcome.INEXACT), quality=ok.double())
-    return row(counted(entry, batch, found, one.scores))
 
 
 def checksum(name: str) -> str:
