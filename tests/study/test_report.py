@@ -22,7 +22,7 @@ from torchsar.metrics.cuts import about_peak, finer, impulse_cuts
 from torchsar.metrics.image import rolled_to
 from torchsar.metrics.impulse import impulse_response
 from torchsar.study.output.numbers import number, quantity, scale_of
-from torchsar.study.output.report import comparisons, draw_all, run_fields
+from torchsar.study.output.report import Picture, before_and_after, comparisons, draw_all, run_fields
 from torchsar.study.trials.system import Column
 
 # --- numbers
@@ -72,8 +72,21 @@ def test_tables_show_uncertainties_of_trials() -> None:
     tree = {"methods": {"recommended": method}, "published": {}, "published_targets": {}}
     columns = {"velocity_rmse_m_s": Column("velocity error", "m/s"), "seconds": Column("time", "s")}
     fields = run_fields(tree, columns, {})
-    rows = {line["name"]: line["cells"] for line in fields["tables"][0]["rows"]}
-    assert rows == {"velocity error (um/s)": ["17.58 ± 0.42"], "time (s)": ["1.250"]}
+    assert fields["tables"][0]["rows"] == [("velocity error (um/s)", [["17.58 ± 0.42"]]), ("time (s)", [["1.250"]])]
+
+
+def test_published_values_stand_beside_those_of_their_method() -> None:
+    row = {"gain_db": 1.5, "width_m": 2e-3}
+    methods = {name: {"cases": {"one": row}, "targets": {}, "outcomes": {}} for name in ("none", "recommended")}
+    methods["recommended"]["estimates"] = {}
+    published = {"gain_db": {"one": {"recommended": "below 2"}}, "width_m": {"one": {"none": 3e-3}, "two": {}}}
+    tree = {"methods": methods, "published": published, "published_targets": {}}
+    columns = {"gain_db": Column("gain", "dB"), "width_m": Column("width", "m"), "lost": Column("lost")}
+    rows = run_fields(tree, columns, {})["tables"][0]["rows"]
+    assert rows == [
+        ("gain (dB)", [["1.500"], ["1.500", "(below 2)"]]),
+        ("width (mm)", [["2", "(3)"], ["2"]]),
+    ]
 
 
 # --- pictures
@@ -256,7 +269,8 @@ def test_panels_wrap_in_one_container_a_picture(result: Path) -> None:
     page = (result / "report.html").read_text()
     rule = re.search(r"\.panels \{([^}]*)\}", page)
     assert rule and "display: flex" in rule.group(1) and "flex-wrap: wrap" in rule.group(1)
-    figures = re.findall(r"<figure>(.*?)</figure>", page, re.DOTALL)
+    lead, *figures = re.findall(r"<figure>(.*?)</figure>", page, re.DOTALL)
+    assert 1 <= lead.count("<img") <= 2
     files = sorted(path.name for path in (result / "figures").iterdir())
     assert len(figures) == len({name.split("_")[0] for name in files})
     assert sum(figure.count("<img") for figure in figures) == len(files)
@@ -285,3 +299,13 @@ def test_the_curve_of_the_velocity_search_is_fine_about_the_estimate(
     fine = 1.01 * np.median(steps)
     assert (steps <= fine).sum() >= 40 and steps.max() > 3 * fine
     assert np.abs(velocity - marks["estimate"]).min() < 1e-3 and np.isfinite(entropy).all()
+
+
+def test_a_report_begins_with_the_images_before_and_after() -> None:
+    curves = Picture(("c.png",), "Curves", "", ("",))
+    shown = Picture(("1.png", "2.png", "3.png"), "Images", "text", ("ideal", "none, peak -9 dB", "recommended"))
+    assert before_and_after([curves, shown], ["none", "other", "recommended"]) == Picture(
+        ("2.png", "3.png"), "Before and after", "text"
+    )
+    assert before_and_after([shown], ["recommended"]) == Picture(("3.png",), "Before and after", "text")
+    assert before_and_after([curves], ["none", "recommended"]) is None

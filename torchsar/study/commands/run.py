@@ -18,7 +18,7 @@ from torchsar.study.commands.requires import refuse_beyond_limits
 from torchsar.study.output.folder import fresh_result
 from torchsar.study.output.numbers import write_json
 from torchsar.study.output.progress import progress
-from torchsar.study.output.report import draw_all, run_fields, write_page
+from torchsar.study.output.report import before_and_after, draw_all, run_fields, write_page
 from torchsar.study.settings.sections import ALL, Loaded, cases_of, key_of
 from torchsar.study.trials.batch import Batch, Found, Result, joined_found, joined_metrics, summary
 from torchsar.study.trials.bench import Bench
@@ -87,6 +87,8 @@ def run(loaded: Loaded, out: Path, command: str = "torchsar run", device: str = 
         fields = run_fields(tree, loaded.system.columns, loaded.system.target_columns)
         notes = [*(("Chosen", text) for text in tree["chosen"]), *loaded.system.notes(tree)]
         definitions = tree["definitions"]
+        processed = [name for name, method in loaded.config.processor.items() if method.input != "clean"]
+        fields["lead"] = before_and_after(pictures, processed)
         page = {"title": loaded.config.title, "command": command, "definitions": definitions, "config": loaded.text()}
         write_page(folder / "report.html", "run.html.j2", pictures, folder / "figures", notes=notes, **page, **fields)
     log.info("finished in %.0f s", time.perf_counter() - began)

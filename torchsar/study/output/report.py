@@ -54,7 +54,9 @@ def installed_version() -> str:
         return "not installed"
 
 
-def write_page(path: Path, template: str, pictures: Sequence[Picture], figures: Path, **fields: Any) -> None:
+def write_page(
+    path: Path, template: str, pictures: Sequence[Picture], figures: Path, lead: Picture | None = None, **fields: Any
+) -> None:
     """Write one HTML file that is self-contained: it loads no external resources.
 
     Args:
@@ -62,6 +64,7 @@ def write_page(path: Path, template: str, pictures: Sequence[Picture], figures: 
         template: Template in the folder `templates` that extends base.html.j2.
         pictures: Pictures in their order.
         figures: Folder of the files of the pictures.
+        lead: Picture at the head of the page, or None.
         fields: Values of the template; the base needs `title`, `command`, `definitions` and
             `config`.
     """
@@ -75,10 +78,11 @@ def write_page(path: Path, template: str, pictures: Sequence[Picture], figures: 
     environment.filters["number"] = number
     shown = [
         {"title": p.title, "caption": p.caption, "sources": [_embedded(figures / file) for file in p.files]}
-        for p in pictures
+        for p in (*pictures, *([] if lead is None else [lead]))
     ]
+    fields = {**fields, "lead": None if lead is None else shown.pop(), "pictures": shown}
     made = f"torchsar-lab {installed_version()}, torch {torch.__version__}, {datetime.now(UTC):%Y-%m-%d %H:%M} UTC"
-    text = environment.get_template(template).render(pictures=shown, made=made, **fields)
+    text = environment.get_template(template).render(made=made, **fields)
     path.write_text(text, encoding="utf-8")
 
 
@@ -142,17 +146,15 @@ def _in_words(outcomes: str | list[str] | None) -> str:
     )
 
 
-def _row(name: str, cells: list[str], soft: bool = False) -> dict[str, Any]:
-    return {"name": name, "cells": cells, "soft": soft}
-
-
 def _sd(row: Mapping[str, Any], key: str) -> float | None:
     """Standard deviation over trials; None for times, which depend on the load of the machine."""
     return None if key == "seconds" else row.get(f"{key}_sd")
 
 
-def _cell(row: Mapping[str, Any], key: str, factor: float) -> str:
-    return number(row.get(key), _sd(row, key), factor)
+def _cell(row: Mapping[str, Any], key: str, factor: float, published: Any = None) -> list[str]:
+    """Number of a metric as text, and the published one in brackets if there is one."""
+    known = [] if published is None else [f"({number(published, None, factor)})"]
+    return [number(row.get(key), _sd(row, key), factor), *known]
 
 
 def _tables(rows: Mapping[str, Any], columns: Shown, published: Mapping[str, Any], first: str) -> list[dict[str, Any]]:
@@ -170,10 +172,11 @@ def _tables(rows: Mapping[str, Any], columns: Shown, published: Mapping[str, Any
         names = [name for name, of in rows.items() if any(row.get(key) is not None for row in of.values())]
         keys = list(dict.fromkeys(one for name in names for one in rows[name]))
         factor, unit = scale_of([rows[name].get(one, {}).get(key) for name in names for one in keys], column.unit)
-        body = [_row(o, [_cell(rows[n].get(o, {}), key, factor) for n in names]) for o in keys]
-        for one, source in published.get(key, {}).items():
-            cells = [_cell(source, name, factor) for name in names]
-            body.append(_row(f"{one}, published", cells, soft=True))
+        known = published.get(key, {})
+        body = [
+            (one, [_cell(rows[name].get(one, {}), key, factor, known.get(one, {}).get(name)) for name in names])
+            for one in keys
+        ]
         if names:
             title = f"{column.label} ({unit})" if unit else column.label
             tables.append({"title": title, "first": first, "columns": names, "rows": body})
@@ -186,12 +189,9 @@ def _one_table(rows: Mapping[str, Any], columns: Shown, published: Mapping[str, 
     for key, column in columns.items():
         values = [rows[name][case].get(key) for name in names]
         factor, unit = scale_of(values, column.unit)
-        label, source = f"{column.label} ({unit})" if unit else column.label, published.get(key, {}).get(case, {})
-        if any(value is not None for value in values):
-            body.append(_row(label, [_cell(rows[name][case], key, factor) for name in names]))
-        if source:
-            cells = [_cell(source, name, factor) if name in source else MISSING for name in names]
-            body.append(_row(f"{label}, published", cells, soft=True))
+        label, known = f"{column.label} ({unit})" if unit else column.label, published.get(key, {}).get(case, {})
+        if known or any(value is not None for value in values):
+            body.append((label, [_cell(rows[name][case], key, factor, known.get(name)) for name in names]))
     return {"title": "", "first": "figure", "columns": names, "rows": body}
 
 
@@ -203,11 +203,14 @@ Drawn = Iterator[tuple[str, str, str, Any]]
 
 @dataclass(frozen=True)
 class Picture:
-    """Files of a figure that are shown side by side, with their title and caption."""
+    """Files of a figure that are shown side by side, with their title and caption, and with the
+    title of each panel.
+    """
 
     files: tuple[str, ...]
     title: str
     caption: str
+    panels: tuple[str, ...] = ()
 
 
 def draw_all(makers: Iterable[Callable[[], Drawn]], folder: Path) -> list[Picture]:
@@ -230,8 +233,29 @@ def draw_all(makers: Iterable[Callable[[], Drawn]], folder: Path) -> list[Pictur
         for file, figure in zip(files, panels, strict=True):
             plot.save(figure, folder / file)
         if files or drawn is None:
-            pictures.append(Picture(files, title[:1].upper() + title[1:], caption))
+            titles = tuple("".join(part.get_title() for part in figure.axes[:1]) for figure in panels)
+            pictures.append(Picture(files, title[:1].upper() + title[1:], caption, titles))
     return pictures
+
+
+def before_and_after(pictures: Iterable[Picture], methods: Iterable[str]) -> Picture | None:
+    """Take the panels of the recommended method and of the first other one from a picture.
+
+    Args:
+        pictures: Pictures in their order; the first with a panel of the recommended method is used.
+        methods: Names of the methods that process the data, in their order.
+
+    Returns:
+        The picture of one or two panels, or None if no method has a panel.
+    """
+    before = next((name for name in methods if name != "recommended"), "")
+    for picture in pictures:
+        # a panel may say more than the name of its method, after a comma
+        files = {title.partition(",")[0]: f for title, f in zip(picture.panels, picture.files)}
+        if "recommended" in files:
+            chosen = [files[name] for name in dict.fromkeys((before, "recommended")) if name in files]
+            return Picture(tuple(chosen), "Before and after", picture.caption)
+    return None
 
 
 def _drawn(make: Callable[[], Drawn]) -> Drawn:

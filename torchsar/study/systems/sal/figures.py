@@ -187,4 +187,4 @@ def _within(reach: float, offset_m: Tensor, response: Tensor) -> tuple[np.ndarra
     return plot.array(offset_m[near]), plot.decibel(response[near])
 
 
-DRAW_CASE = (_profiles, _images, _motion, _slices)
+DRAW_CASE = (_images, _profiles, _motion, _slices)
