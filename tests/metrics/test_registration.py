@@ -49,6 +49,18 @@ def test_errors_of_amplitude_and_of_phase_are_apart() -> None:
     assert bool((faded["amplitude_error_db"] > -12).all()) and bool((faded["phase_error_rad"] < 0.02).all())
     unrelated = registered_errors(torch.zeros_like(image), image)
     assert float(unrelated["amplitude_error_db"][0]) == 0 and float(unrelated["phase_error_rad"][0]) > 1.8
+    # moduli of unrelated speckle fit each other by chance; the fit of the registration adds little
+    other = torch.randn(6, 64, 64, dtype=torch.complex128, generator=torch.Generator().manual_seed(4))
+    level = registered_errors(other[:3], other[3:])["amplitude_error_db"]
+    chance = 10 * math.log10(1 - (math.pi / 4) ** 2)
+    assert all(chance - 0.5 < one < chance + 0.2 for one in level[level < 0].tolist()) and bool((level < 0).any())
+
+
+def test_points_that_lie_elsewhere_have_nothing_in_common() -> None:
+    one, other = (torch.zeros(64, 64, dtype=torch.complex128) for _ in range(2))
+    one[(10, 30, 50), (10, 40, 13)] = other[(20, 44, 55), (33, 9, 50)] = 1
+    found = registered_errors(one, other)
+    assert float(found["amplitude_error_db"]) > -1.5 and float(found["image_error_db"]) > -1.5
 
 
 def points(places: Tensor, amplitude: Tensor, size: tuple[int, int]) -> Tensor:
