@@ -59,9 +59,9 @@ class StraightTrack:
         number = number - number.mean()
         step = (number[:, None] * position_m).sum(0) / number.square().sum()
         length = torch.linalg.vector_norm(step)
-        if not float(length) > 0:
+        if not float(length.detach()) > 0:
             raise ValueError("the antenna does not advance along a line; a straight track needs one that moves")
-        return StraightTrack(position_m.mean(0), step / length, float(length))
+        return StraightTrack(position_m.mean(0), step / length, float(length.detach()))
 
     def along_m(self, points_m: Tensor) -> Tensor:
         """Return the coordinate along the track, float64 (...,).

@@ -130,7 +130,7 @@ def packaged_configs() -> dict[str, Path]:
 
 def experiments() -> str:
     """Return the packaged configs with their titles, for `torchsar list`."""
-    lines = ["EXPERIMENTS (torchsar run NAME; those marked [sweep] are for torchsar sweep NAME)"]
+    lines = ["EXPERIMENTS (torchsar run NAME, or FILE for a config of your own; [sweep]: torchsar sweep NAME)"]
     for name, path in packaged_configs().items():
         tree = read_tree(path)
         lines.append(f"  {name:<25}{tree.get('title', '')}{' [sweep]' if 'sweep' in tree else ''}")
