@@ -203,7 +203,7 @@ def test_vibration_is_found_as_a_tone() -> None:
         20 * unit_time(400) + 0.8 * torch.sin(2 * math.pi * 0.05 * k + 0.3) + 0.3 * torch.sin(2 * math.pi * 0.0173 * k)
     )
     error = [float(rms(off(align_envelopes(shift_range(x, true), tones=t)["shift_cells"], true)).max()) for t in (0, 2)]
-    assert error[1] < 0.05 < 0.4 < error[0]
+    assert error[1] < 0.05 < 0.25 < error[0]
 
 
 def test_failure_at_low_snr_is_reported() -> None:
@@ -396,3 +396,16 @@ def test_jumps_of_the_range_gate_cost_no_accuracy(cells: float, share: float, la
     away = change - truth["shift_cells"]
     away = away - away.median(-1, keepdim=True).values
     assert after.ok.all() and away.abs().max() < 0.02
+
+
+@pytest.mark.parametrize(("cells", "share", "lasting"), [(1.0, 1.0, False), (10.0, 1.0, False), (10.0, 0.1, True)])
+def test_jumps_are_found_at_low_snr_or_doubted(cells: float, share: float, lasting: bool) -> None:
+    """At -8 dB large jumps cannot be found, and a smooth course was ok with errors of 7 cells."""
+    for snr_db in (0.0, -8.0) if cells > 1 else (0.0,):
+        batch = aligned(snr_db, 3.0)(6, 6)
+        recording = Recording(Signal(batch.data, LADAR.raw_axes(*batch.data.shape[-2:])), LADAR)
+        moved, truth = GateJumps(cells, share, lasting)(recording, Draws(5, trials=range(6)))
+        found, clean = align_envelopes(moved.signal.data), align_envelopes(batch.data)
+        error = rms(off(found["shift_cells"], batch.truth["shift_cells"] + truth["shift_cells"], 128))
+        assert not (found.ok & (error > 0.05)).any()
+        assert snr_db < 0 or (found.ok.all() and clean.ok.all())

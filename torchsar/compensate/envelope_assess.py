@@ -54,7 +54,7 @@ def deviation(
     count = (present.sum(-1) - 1).clamp_min(1)
     if std is not None:
         agree = (apart.square().sum(-1) / count).sqrt() < GOOD_CELLS
-        return std, agree & (std < GOOD_CELLS / 2)
+        return (std.square() + 1e-6).sqrt(), agree & (std < GOOD_CELLS / 4)
     # a larger difference between the shifts of both halves of the band means that one of them was
     # found at a wrong maximum
     usual = 4.0 * robust_std(apart.abs(), present)

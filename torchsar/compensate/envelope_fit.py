@@ -248,11 +248,10 @@ def smooth_shifts(pulses: Envelopes, degree: int, passes: int, blocks: int) -> t
 
 
 def gate_jumps(pulses: Envelopes, smooth: Tensor) -> Tensor:
-    """Find jumps of the range gate by whole cells, beside smooth shifts.
+    """Find jumps of the range gate by whole cells, beside smooth shifts, from single pulses.
 
-    Where the likeliest place of any pulse is clearly another than the smooth one, the shifts of
-    single pulses are found, and the whole cells of their differences from pulse to pulse add up to
-    the jumps. The fractions of a cell are those of the smooth motion, which near pulses share.
+    The whole cells of the differences of single shifts from pulse to pulse add up to the jumps. The
+    fractions of a cell are those of the smooth motion, which near pulses share.
 
     Args:
         pulses: Envelopes.
@@ -261,35 +260,77 @@ def gate_jumps(pulses: Envelopes, smooth: Tensor) -> Tensor:
     Returns:
         Jumps in whole cells, 0 for the first pulse, shape (trial, pulse), float64.
     """
-    jumps = torch.zeros_like(smooth)
-    place, gain = _likeliest(pulses, smooth)
-    # noise alone seldom gains this many nats at the likeliest of all places
-    suspect = ((place != 0) & (gain > math.log(2 * pulses.n))).any(-1)
-    at = true_positions(suspect, host_value(suspect.sum(), len(suspect)))
-    if not len(at):
-        return jumps
-    some = Envelopes(pulses.spectra[at], pulses.present[at], pulses.n)
-    single = single_shifts(some, running_shifts(some, 0.1), "likelihood", 4)
-    step = wrapped((single_shifts(some, single, "refined", 2) - smooth[at]).diff(dim=-1), pulses.n)
+    single = single_shifts(pulses, running_shifts(pulses, 0.1), "likelihood", 4)
+    step = wrapped((single_shifts(pulses, single, "refined", 2) - smooth).diff(dim=-1), pulses.n)
     # of 33 pairs of pulses, which is few for any motion and many for the jitter of single shifts
-    both = (some.present[:, 1:] & some.present[:, :-1])[:, None]
+    both = (pulses.present[:, 1:] & pulses.present[:, :-1])[:, None]
     phasor = torch.stack([torch.cos(2 * math.pi * step), torch.sin(2 * math.pi * step)], -2) * both
     near = torch.nn.functional.avg_pool1d(phasor, 33, 1, 16)
     common = torch.atan2(near[:, 1], near[:, 0]) / (2 * math.pi)
-    whole = torch.nn.functional.pad(torch.round(step - common).cumsum(-1), (1, 0))
-    return jumps.index_copy(0, at, whole)
+    return torch.nn.functional.pad(torch.round(step - common).cumsum(-1), (1, 0))
 
 
-def _likeliest(pulses: Envelopes, course: Tensor) -> tuple[Tensor, Tensor]:
-    """Likeliest place in cells, beside shifts (trial, pulse), of each pulse in the mean envelope,
-    and its gain in log-likelihood; 0 for pulses that are not present.
+def likeliest_jumps(
+    pulses: Envelopes, course: Tensor, jump: Tensor, rounds: int = 3, sure_cells: float = 0.01
+) -> tuple[Tensor, Tensor]:
+    """Find the likeliest jump of each pulse, given all pulses, and how uncertain it is.
+
+    The gate stays where it is from one pulse to the next, or jumps to any cell with a probability
+    that is found with the jumps. Each pulse is compared with the mean envelope of the others.
+
+    Args:
+        pulses: Envelopes.
+        course: Shifts without jumps in cells, shape (trial, pulse).
+        jump: Jumps in whole cells with which the mean envelope is formed, shape (trial, pulse).
+        rounds: Number of times that the probability of a jump is found anew.
+        sure_cells: Largest deviation by single pulses alone with which the given jumps are kept.
+
+    Returns:
+        The jumps in whole cells, 0 for the first pulse, shape (trial, pulse), float64; and the rms
+        deviation in cells of the place of a pulse from the given jump, shape (trial,), float64.
     """
-    moved = pulses.moved(course)
-    against = pulses.likelihood(moved.sum(-2, keepdim=True) / pulses.count)
-    likely = pulses.on_grid(moved * against.conj()) / _HALF
-    gain, at = (likely - likely[..., :1]).max(-1)
-    place = wrapped(at.to(torch.float64) / _HALF, pulses.n)
-    return torch.where(pulses.present, place, 0), torch.where(pulses.present, gain, 0)
+    n, used = pulses.n, pulses.moved(course + jump)
+    best, cells = jump - jump[:, :1], wrapped(torch.arange(pulses.n, dtype=torch.float64, device=jump.device), pulses.n)
+
+    def scores(moved: Tensor, mean: Tensor) -> Tensor:
+        likely = pulses.on_grid(moved * pulses.likelihood(mean).conj())[..., ::_HALF] / _HALF
+        return torch.where(pulses.present[..., None], (likely - likely.amax(-1, keepdim=True)).exp(), 0)
+
+    def spread(weight: Tensor, square: Tensor) -> Tensor:
+        each = (weight * square).sum(-1) / weight.sum(-1).clamp_min(1e-30)
+        return (each.sum(-1) / pulses.count[:, 0, 0]).sqrt()
+
+    # where single pulses are sure by themselves, the others need not be asked
+    apart = spread(scores(used, used.sum(-2, keepdim=True) / pulses.count).to(cells.dtype), cells.square())
+    unsure = apart > sure_cells
+    at = true_positions(unsure, host_value(unsure.sum(), len(unsure)))
+    if not len(at):
+        return best, apart
+    pulses, used, jump = Envelopes(pulses.spectra[at], pulses.present[at], n), used[at], jump[at]
+    others = (used.sum(-2, keepdim=True) - used) / (pulses.count - 1).clamp_min(1)
+    likely = scores(pulses.moved(course[at]), others)
+    likely = torch.where(pulses.present[..., None], likely, 1)
+    ways = torch.stack([likely, likely.flip(1)])  # forward and backward in slow time
+    chance = (jump.diff() != 0).to(likely.dtype).mean(-1, keepdim=True).nan_to_num().clamp_min(0.1)
+    for _ in range(rounds):
+        state, known = torch.full_like(ways[:, :, 0], 1 / n), []
+        for now in ways.unbind(2):
+            state = (1 - chance) * state + chance / n
+            known.append(state)
+            state = state * now
+            state = state / state.sum(-1, keepdim=True)
+        before, after = torch.stack(known, 2)
+        before, after = before * likely, after.flip(1)
+        here = before * after
+        early, late = before[:, :-1], (after * likely)[:, 1:]
+        stays = (early * late).sum(-1) / (early.sum(-1) * late.sum(-1))
+        jumps = (chance / n) / ((1 - chance) * stays + chance / n)
+        chance = jumps.mean(-1, keepdim=True).clamp_min(1 / likely.shape[1])
+    off, found = wrapped(cells - jump[..., None], n), cells[here.argmax(-1)]
+    apart = apart.index_copy(
+        0, at, spread(torch.where(pulses.present[..., None], here, 0).to(cells.dtype), off.square())
+    )
+    return best.index_copy(0, at, found - found[:, :1]), apart
 
 
 def mean_drift(pulses: Envelopes) -> Tensor:

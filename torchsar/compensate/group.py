@@ -346,7 +346,7 @@ def quotient(value: Tensor, curvature: Tensor) -> Tensor:
         curvature: Curvatures, same shape.
 
     Returns:
-        The quotient, 1e6 at most and where the curvature is not positive.
+        The quotient, infinite where the curvature is not positive.
     """
     good = curvature > 0
-    return torch.where(good, value / torch.where(good, curvature, 1), 1e6).clamp_max(1e6)
+    return torch.where(good, value / torch.where(good, curvature, 1), math.inf)

@@ -198,6 +198,8 @@ def minimum_entropy_velocity(
     slope = (high - low - level * (shares[2] - shares[0])) / (2 * half[..., None, None])
     # the step leads to the vertex of the parabola, and at most to its ends
     value = value - torch.minimum(torch.maximum(quotient(slope.sum((-2, -1)), curvature), -half), half)
+    inside = inside & ((value.detach() - nominal).abs() <= reach)
+    value = value.clamp(nominal - reach, nominal + reach)
     points = nominal + torch.linspace(-reach, reach, costs.shape[-1], dtype=torch.float64, device=start.device)
     found = Estimate({"velocity_m_s": value}, info={"grid_velocity_m_s": points, "grid_entropy": costs})
     if not assess:

@@ -77,7 +77,7 @@ def assessed(
     sets = [torch.stack([entropy(one[..., k::4, :]) for k in range(4)], -1) for one in rows]
     bend = (sets[0] - 2 * sets[1] + sets[2]).mean(-1) / half_m_s.square()
     by_combs = quotient(((sets[2] - sets[0]) / (2 * half_m_s[..., None])).std(-1) / 2, bend)
-    std = torch.hypot(torch.maximum(by_parts, by_combs), rest).clamp_max(1e6)
+    std = torch.hypot(torch.maximum(by_parts, by_combs), rest)
     # velocity error of an eighth of a cycle of phase at the ends of the aperture
     most = 0.27 * width if known is None else torch.full_like(width, step / 8)
     short = known is not None and group.data.shape[-2] < known * radar.prf_hz
@@ -90,7 +90,7 @@ def assessed(
         (Outcome.NOISE, ~((curvature > 0) & (depth > 8.0 * _noise_std(nominal, weight)))),
         (Outcome.EMPTY, (group.data == 0).all((-2, -1))),
     )
-    quality = torch.exp(-std / most.clamp_min(1e-12))
+    quality = torch.exp(-std / most.clamp_min(1e-12)).nan_to_num(0.0)
     return replace(found, std={"velocity_m_s": std}, quality=quality, outcome=outcome)
 
 
