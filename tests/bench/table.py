@@ -76,6 +76,10 @@ LIMITS: dict[str, dict[tuple[str, str], str]] = {
     "a gap of a fifth of the pulses: the phases of its two sides may differ by a constant, which the deviation lacks": {
         ("autofocus", "gap, 10 dB"): "sca, entropy_fixed_point, phase_polish"
     },
+    "a strip, whose scatterers are lit in turn, given to a method that takes all of them as lit: StripAutofocus": {
+        ("path", "strip, 3 mm, 0 dB"): "autofocus, entropy_fixed_point",
+        ("path", "strip, 3 mm, 20 dB"): "autofocus",
+    },
     "a moving point 26 dB above what is at rest: its side lobes are in all range cells alike": {
         ("channels", "moving point, 20 dB"): "ClutterSynchronisation"
     },

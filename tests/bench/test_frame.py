@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -283,6 +284,15 @@ def test_scores_without_neighbours_show_what_a_method_reads_from_them() -> None:
     honest, cheat = (without_time(few(method, half)["all"]) for method in (autofocus, of_neighbours))
     alone = without_time(few(of_neighbours, half, batch=1)["all"])
     assert cheat["ok"] != honest["ok"] and alone["ok"] == honest["ok"]
+
+
+def test_time_of_a_process_that_a_method_starts_counts() -> None:
+    def elsewhere(x: Tensor) -> Tensor:
+        subprocess.run([sys.executable, "-c", "for i in range(2_000_000): pass"], check=True)
+        return torch.zeros(x.shape[:-1])
+
+    here, there = (few(method, SOME[1:2])["all"]["pairs"] for method in (methods.uncorrected, elsewhere))
+    assert there > 20 * here
 
 
 def test_recorded_pulses_get_remarks_and_no_order(

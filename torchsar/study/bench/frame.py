@@ -7,6 +7,7 @@ world draws data by a fixed seed and gives the truth, or says that there is noth
 from __future__ import annotations
 
 import math
+import os
 import pickle
 import time
 import warnings
@@ -213,6 +214,11 @@ def refused(batch: Batch) -> Numbers:
     return numbers if batch.truth is None else numbers | {"right": no, "needless": no}
 
 
+def processor_seconds() -> float:
+    """Processor time of this process and of those that it has started and that have ended."""
+    return time.process_time() + sum(os.times()[2:4])
+
+
 def pair_seconds(x: Tensor, least: float = 0.01) -> float:
     """Processor time of a transform of all samples along the pulses, forward and back."""
     count, began = 0, time.process_time()
@@ -233,7 +239,7 @@ def tried(
     answers: list[tuple[Estimate, Numbers] | None] = []
     sentence = None
     for part in (part for block in blocks for part in block.parts(batch)):
-        began = time.process_time()
+        began = processor_seconds()
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -242,7 +248,7 @@ def tried(
             sentence = str(refusal)
             answers.append(None)
             continue
-        spent = time.process_time() - began
+        spent = processor_seconds() - began
         pair = pair_seconds(samples(part.data))
         times = {"time:method": torch.tensor([spent]), "time:pairs": torch.tensor([pair])}
         answers.append((estimate, times))
