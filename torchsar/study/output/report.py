@@ -98,7 +98,7 @@ def run_fields(metrics: Mapping[str, Any], columns: Shown, target_columns: Shown
         columns: Label and unit of each metric.
         target_columns: Label and unit of each metric of targets.
     """
-    methods = metrics["methods"]
+    methods = {"recommended": metrics["methods"]["recommended"], **metrics["methods"]}
     best, cases = methods["recommended"], list(methods["recommended"]["cases"])
     rows = {name: method["cases"] for name, method in methods.items()}
     published = metrics["published"]
