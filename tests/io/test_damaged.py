@@ -19,7 +19,7 @@ from scipy.io import savemat
 
 from torchsar.cli import main
 from torchsar.core import Recording, stored
-from torchsar.io import import_recording, read_array, read_inverse, read_path, read_stripmap
+from torchsar.io import import_recording, read, read_array, read_inverse, read_path, read_stripmap
 
 Members = dict[str, np.ndarray]
 Reader = Callable[[Path], Recording]
@@ -297,6 +297,40 @@ def test_numbers_that_hdf5_invents_are_refused(tmp_path: Path, monkeypatch: pyte
         file["iq"] = STRIPMAP["iq"]
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=100))
     assert "becomes an archive of 3.84e-06 GB, and 1e-07 GB are free" in imported(path)
+
+
+@pytest.mark.parametrize(
+    ("held", "said"),
+    [
+        ({**STRIPMAP, "chirp_rate_hz_s": 0.72}, r"pulse_s is 0.72 Hz/s times .* if it is in MHz/us, say so"),
+        (
+            {**STRIPMAP, "iq": STRIPMAP["iq"][:1]},
+            r"iq must be .* two lines of at least one sample, got int8 of shape \(1, ",
+        ),
+        (
+            {**TURNTABLE, "freq_hz": TURNTABLE["freq_hz"] / 1e9},
+            r"freq_hz is .* Hz in the middle, .* if it is in GHz, say",
+        ),
+        (
+            {"samples": np.ones((3, 4), complex)},
+            r"must hold one of the sample arrays iq \(strip\), .* keys \['samples'\]",
+        ),
+    ],
+)
+def test_mislabelled_archives(tmp_path: Path, held: dict[str, np.ndarray], said: str) -> None:
+    np.savez(tmp_path / "data.npz", allow_pickle=False, **held)
+    with pytest.raises(ValueError, match=f"data.npz.* {said}"):
+        read(tmp_path / "data.npz")
+
+
+@pytest.mark.parametrize(("name", "content"), [("a.cphd", b"CPHD/1.1.0\r\n" * 9), ("a.nitf", b"NITF02.10" + b" " * 30)])
+def test_what_a_library_says_of_its_own_variables_is_no_cause(tmp_path: Path, name: str, content: bytes) -> None:
+    pytest.importorskip("sarkit", reason="the extra `formats` is not installed")
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(
+        ValueError, match=rf"{name} cannot be read as .*: it is damaged or of another kind \(ValueError: "
+    ):
+        read(tmp_path / name)
 
 
 def test_a_picture_beyond_the_memory_is_refused_by_its_header(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -395,6 +395,7 @@ FLAT_MISTAKES: dict[str, tuple[dict[str, Any], list[str]]] = {
     ),
     "a shape": ({"samples.shape": [12, -1, 2]}, ["shape must be a list of numbers of at least 1", "[12, -1, 2]"]),
     "a type": ({"samples.dtype": "in8"}, ["samples.dtype has the value 'in8'", "did you mean 'int8'"]),
+    "an order of I alone": ({"samples.order": "ii"}, ["radar.yaml: samples.order: order must have as many i as q"]),
     "an order": ({"samples.byte_order": "bg"}, ["samples.byte_order has the value 'bg'", "did you mean 'big'"]),
     "a name": ({"samples.name": "iq"}, ["is no HDF5, MATLAB, numpy or .csv file", "give dtype and shape, and no name"]),
     "an array without a file": ({"side.agc_db": "gain"}, ["side.agc_db", "is no HDF5, MATLAB, numpy or .csv file"]),

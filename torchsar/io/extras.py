@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from traceback import walk_tb
 from typing import Any
 
 
@@ -79,7 +80,9 @@ def reading(path: Path, kind: str) -> Iterator[None]:
         text = " ".join(str(error).split())
         if str(error).startswith(str(path)):
             raise ValueError(text) from None
-        plain = isinstance(error, ValueError) and text
+        # what libraries say of their own variables names no cause
+        *_, (raised, _) = walk_tb(error.__traceback__)
+        plain = isinstance(error, ValueError) and text and raised.f_globals["__name__"].startswith("torchsar.")
         reason = (
             text if plain else f"it is damaged or of another kind ({type(error).__name__}{': ' if text else ''}{text})"
         )

@@ -258,31 +258,41 @@ def likely_unit(value: float, low: float, high: float, units: Mapping[str, float
     return f"; if it is in {found}, say so or convert it" if found else "; check it"
 
 
-def refuse_implausible(
-    frequency_hz: Tensor, position_m: Tensor, reference_m: Tensor, names: tuple[str, str, str]
-) -> None:
-    """Check the unit of the frequencies and positions of a phase history by physics.
+def refuse_carrier(frequency_hz: Tensor, name: str) -> None:
+    """Check the unit of frequencies by physics.
+
+    Args:
+        frequency_hz: Frequencies, (frequency,).
+        name: Their name, for the message.
+
+    Raises:
+        ValueError: If the carrier is not that of a radar or ladar.
+    """
+    low, high = 1e6, 3e15  # limits in Hz; the wavelengths are 300 m and 100 nm
+    carrier = float(frequency_hz.mean())
+    if not low <= carrier <= high:
+        unit = likely_unit(carrier, 1e8, 1e12, {"GHz": 1e9, "MHz": 1e6, "kHz": 1e3, "THz": 1e12})
+        raise ValueError(f"{name} is {carrier:.4g} Hz in the middle, and should be {low:g} to {high:g} Hz{unit}")
+
+
+def refuse_implausible(frequency_hz: Tensor, position_m: Tensor, reference_m: Tensor, names: tuple[str, str]) -> None:
+    """Check the unit of the positions of a phase history by physics.
 
     Args:
         frequency_hz: Frequencies, (frequency,).
         position_m: Positions of the moving antenna, (pulse, 3).
         reference_m: Reference ranges, (pulse,).
-        names: Names of the three for messages.
+        names: Names of positions and reference ranges for messages.
 
     Raises:
-        ValueError: If the carrier is not that of a radar or ladar. The error is also raised if
-            distance from the origin and reference range differ by a factor of 1000, or if the whole
-            path is shorter than a quarter of a wavelength.
+        ValueError: If distance from the origin and reference range differ by a factor of 1000, or
+            if the whole path is shorter than a quarter of a wavelength.
     """
-    low, high = 1e6, 3e15  # limits in Hz; the wavelengths are 300 m and 100 nm
-    carrier, distance = float(frequency_hz.mean()), float(torch.linalg.vector_norm(position_m, dim=-1).median())
-    if not low <= carrier <= high:
-        unit = likely_unit(carrier, 1e8, 1e12, {"GHz": 1e9, "MHz": 1e6, "kHz": 1e3, "THz": 1e12})
-        raise ValueError(f"{names[0]} is {carrier:.4g} Hz in the middle, and should be {low:g} to {high:g} Hz{unit}")
+    distance = float(torch.linalg.vector_norm(position_m, dim=-1).median())
     reference, extent = float(reference_m.median()), position_m.amax(0) - position_m.amin(0)
     ratio = reference / distance if distance > 0 else 0.0
     # in the same unit, a path and its reference range differ by some percent
-    for factor, of, other in ((1e3, names[1], names[2]), (1e-3, names[2], names[1])):
+    for factor, of, other in ((1e3, *names), (1e-3, *reversed(names))):
         # up to a factor of 2 because a one-way range may be given instead of the whole path
         if 0.4 * factor < ratio < 2.5 * factor:
             near, far = (distance, reference) if factor > 1 else (reference, distance)
@@ -290,7 +300,7 @@ def refuse_implausible(
                 f"{of} has a distance of {near:.4g} m, and {other} one of {far:.4g} m, about 1000 times as much; {of} "
                 "is probably in km, say so or convert it"
             )
-    wavelength = LIGHT_M_S / carrier
+    wavelength = LIGHT_M_S / float(frequency_hz.mean())
     if 0 < float(extent.norm()) < wavelength / 4:
         middle = position_m.mean(0).tolist()
         degrees = abs(middle[0]) <= 90 and abs(middle[1]) <= 180 and abs(middle[2]) > 100
@@ -300,7 +310,7 @@ def refuse_implausible(
             else "in km"
         )
         raise ValueError(
-            f"{names[1]} moves by {float(extent.norm()):.3g} m over all pulses, less than a quarter of the wavelength "
+            f"{names[0]} moves by {float(extent.norm()):.3g} m over all pulses, less than a quarter of the wavelength "
             f"of {wavelength:.3g} m, about {', '.join(f'{x:.6g}' for x in middle)}; it is probably {likely}"
         )
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from torchsar.core import Recording, refuse_non_finite, unit_phasor
-from torchsar.io.fields import joined, parted, refuse_implausible
+from torchsar.io.fields import joined, parted, refuse_carrier, refuse_implausible
 from torchsar.io.history import history_radar
 from torchsar.radar import AntennaPath, range_profiles
 from torchsar.repair.analytic import delayed
@@ -103,7 +103,8 @@ def fmcw_recording(
     frequency = start_hz + slope_hz_s * (delay_s + torch.arange(data.shape[-1], dtype=torch.float64) / sampling_hz)
     if slope_hz_s < 0:
         frequency, data = frequency.flip(0), data.flip(-1)
-    refuse_implausible(frequency, place, torch.zeros(1), ("start_hz", "position_m", "the reference"))
+    refuse_carrier(frequency, "start_hz")
+    refuse_implausible(frequency, place, torch.zeros(1), ("position_m", "the reference"))
     n, step = len(frequency), abs(slope_hz_s) / sampling_hz
     profiles = range_profiles((data.conj() if beat_sign > 0 else data).resolve_conj()).flatten(0, 1)
     late = torch.remainder(torch.arange(n, dtype=torch.float64) - n // 2, n) / (n * step)

@@ -37,6 +37,11 @@ class Format:
 def _read_archive(path: Path, dtype: torch.dtype) -> Recording:
     """Read the recording in a numpy archive of any kind that this package reads."""
     keys = archive(path, "recorded data")
+    if not {"iq", "history", "fp", "sig", "profiles"} & {*keys}:
+        raise ValueError(
+            f"{path} must hold one of the sample arrays iq (strip), history or fp (any path), sig (turntable) or "
+            f"profiles (target in flight), got the keys {sorted(keys)}; torchsar import gives arrays these names"
+        )
     if "iq" in keys:
         return read_stripmap(path, dtype)
     return (read_path if "history" in keys or "fp" in keys else read_inverse)(path, dtype)

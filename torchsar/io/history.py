@@ -18,6 +18,7 @@ from torchsar.io.fields import (
     naming,
     number,
     read_described,
+    refuse_carrier,
     refuse_implausible,
     refuse_missing,
     shown,
@@ -186,6 +187,7 @@ def frequencies(field: StoredArray, n: int) -> Tensor:
         ValueError: If the field holds anything else.
     """
     frequency = vector(field, n)
+    refuse_carrier(frequency, field.what)
     with naming(field.what):
         frequency_step_hz(frequency)
     return frequency
@@ -226,7 +228,7 @@ def _spotlight_radar(fields: Mapping[str, StoredArray], shape: tuple[int, ...]) 
             "r0_m must be positive and the antenna must not be at the scene centre, "
             f"got a least r0_m of {float(reference.min()):g}"
         )
-    refuse_implausible(frequency, position, reference, ("freq_hz", "the antenna position x_m, y_m, z_m", "r0_m"))
+    refuse_implausible(frequency, position, reference, ("the antenna position x_m, y_m, z_m", "r0_m"))
     prf = number(fields["prf_hz"]) if "prf_hz" in fields else 1.0
     first, last = (position[i] / torch.linalg.vector_norm(position[i]) for i in (0, -1))
     chord = float(torch.linalg.vector_norm(last - first))
@@ -323,7 +325,7 @@ def describe_path(fields: Mapping[str, StoredArray], path: Path) -> Described:
             raise ValueError(f"path_reference_m must be paths of 0 m or more, got a mean of {2 * reference_m:g} m")
         moved = max(antennas.places, key=lambda place: float(place.std(0).norm()))
         half = antennas.reference_m / 2
-        refuse_implausible(frequency, moved, half, ("freq_hz", "transmitter_m", "path_reference_m"))
+        refuse_implausible(frequency, moved, half, ("transmitter_m", "path_reference_m"))
         radar = history_radar(frequency, _prf_hz(fields, time), reference_m)
         origin = {"origin_deg_m": vector(fields["origin_deg_m"], 3)} if "origin_deg_m" in fields else {}
     aux = {"frequency_hz": frequency, **antennas.side_data(), **origin}

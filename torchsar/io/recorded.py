@@ -145,10 +145,15 @@ def describe_stripmap(fields: Mapping[str, StoredArray], path: Path) -> Describe
     first = number(fields["first_cell"], "whole number") if "first_cell" in fields else 1
     iq = fields["iq"]
     real = len(iq.shape) == 3 and iq.shape[-1] == 2 and iq.dtype.kind in "iuf"
-    if 0 in iq.shape or not (real or (len(iq.shape) == 2 and iq.dtype.kind == "c")):
+    if (
+        0 in iq.shape
+        or len(iq.shape) < 2
+        or iq.shape[0] < 2
+        or not (real or (len(iq.shape) == 2 and iq.dtype.kind == "c"))
+    ):
         raise ValueError(
-            f"{iq.what} must be complex (line, sample) or (line, sample, 2) with real I and Q, at least one sample, "
-            f"got {iq.described}"
+            f"{iq.what} must be complex (line, sample) or (line, sample, 2) with real I and Q, two lines of at "
+            f"least one sample, got {iq.described}"
         )
     with naming(path):
         _refuse_implausible(numbers, c)
@@ -201,10 +206,14 @@ def _refuse_implausible(numbers: Mapping[str, float], c: float) -> None:
             factors = {"Hz": {"MHz": 1e6, "GHz": 1e9, "kHz": 1e3}, "s": {"us": 1e-6, "ms": 1e-3, "ns": 1e-9}}
             likely = likely_unit(numbers[key], low, high, factors.get(unit, {"km": 1e3, "mm": 1e-3}))
             raise ValueError(f"{key} is {numbers[key]:g} {unit}, and should be {low:g} to {high:g} {unit}{likely}")
-    carrier, band = numbers["f0_hz"], abs(numbers["chirp_rate_hz_s"]) * numbers["pulse_s"]
-    if band > 2 * carrier:
+    rate, duration = abs(numbers["chirp_rate_hz_s"]), numbers["pulse_s"]
+    low, high = 1e-3 / duration**2, 2 * numbers["f0_hz"] / duration
+    if not low <= rate <= high:
+        likely = likely_unit(rate, low, high, {"MHz/us": 1e12, "kHz/us": 1e9, "MHz/s": 1e6})
         raise ValueError(
-            f"the bandwidth chirp_rate_hz_s pulse_s is {band:g} Hz, beyond f0_hz of {carrier:g} Hz; check it"
+            f"the bandwidth chirp_rate_hz_s pulse_s is {rate:g} Hz/s times {duration:g} s, {rate * duration:g} Hz, and "
+            f"should be {1e-3 / duration:g} Hz, 0.001 / pulse_s, to {2 * numbers['f0_hz']:g} Hz, twice "
+            f"f0_hz{likely}"
         )
     if numbers["pulse_s"] * numbers["prf_hz"] > 1:
         raise ValueError(

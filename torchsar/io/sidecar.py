@@ -322,17 +322,14 @@ def _order(
     tree: Mapping[str, Any], where: str, dims: list[str], shape: Mapping[str, int], slow: str
 ) -> Callable[[np.ndarray], Sequence[np.ndarray]]:
     """Function that separates I and Q according to their order in the file."""
-    order = tree.get("order", "iq")
+    order, before = tree.get("order", "iq"), dims[-2]
     if "iq" not in dims and "order" in tree:
         raise ValueError(f"{where}.order is for samples with a dim iq, got the dims {dims}")
-    if len(order) == 2 and "iq" in dims:
-        return lambda x: parted(np.moveaxis(x, dims.index("iq"), -1), order)
-    before = dims[-2] if len(dims) > 1 else ""
-    if "order" in tree and (dims[-1] != "iq" or before == slow or before in tree.get("choose", {})):
+    if len(order) != 2 and (dims[-1] != "iq" or before == slow or before in tree.get("choose", {})):
         raise ValueError(f"{where}.order {order!r} needs iq as the last dim, after the fast one, got {dict(shape)}")
     with naming(f"{where}.order"):
         parted(np.empty((shape[before], 2)), order)
-    return lambda x: parted(x, order)
+    return lambda x: parted(np.moveaxis(x, dims.index("iq"), -1), order)
 
 
 def _offset(tree: Mapping[str, Any], where: str) -> complex:

@@ -194,7 +194,7 @@ def read_table(path: Path) -> dict[str, np.ndarray]:
             raise ValueError(f"{path}: row {number} has {len(values)} numbers, and others have {len(rows[0])}")
         rows.append(values)
     if not rows:
-        raise ValueError(f"{path} holds no rows of numbers")
+        raise ValueError(f"{path} holds no rows of numbers{f'; it begins with {lines[0][:60]!r}' if lines else ''}")
     twice = {name for name in names if names.count(name) > 1}
     if twice:
         raise ValueError(f"{path}: several columns have the name {min(twice)!r}; give each a name of its own")
