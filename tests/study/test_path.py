@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from tests.study.scenes import PATH, TILES, bench_of, loaded_as, run, world
-from torchsar.core import Draws, Estimate
+from torchsar.core import Axis, Draws, Estimate, Signal, centred_ifft
 from torchsar.radar import LIGHT_M_S
 from torchsar.study.commands.requires import refuse_beyond_limits
 from torchsar.study.commands.run import _entry
@@ -56,6 +56,24 @@ def test_the_residual_of_a_path_has_no_shift_and_is_that_of_the_truth(tmp_path: 
     found = metrics_of(bench)["none"]
     torch.testing.assert_close(found["path_residual_rms_m"], torch.full((2,), 6.83e-4).double(), rtol=0.01, atol=0)
     assert bool((found["image_shift_m"] > 0.02).all()) and bool((found["position_error_rms_m"] < 0.03).all())
+
+
+def test_images_of_one_path_are_compared_without_registration(tmp_path: Path) -> None:
+    """A shift is an error as in `requires`, but where another path than that of the reference is
+    used, since autofocus cannot observe it.
+    """
+    bench, axes = bench_of(tmp_path, "path"), (Axis("azimuth", 64, 0.0, 0.5, "m"), Axis("range", 64, 0.0, 0.5, "m"))
+    image = centred_ifft(centred_ifft(torch.randn(64, 64, dtype=torch.complex128)[20:44, 20:44].contiguous()), -2)
+    image = torch.nn.functional.pad(image, (20, 20, 20, 20))
+
+    def of(data: torch.Tensor, left_m: float) -> Processed:
+        judged = Judged({"path_residual_rms_m": torch.zeros(1)}, view=torch.full((1, 40), left_m).double())
+        return Processed(judged, signal=Signal(data, axes))
+
+    ideal, moved = of(image, 0.0), image.roll(2, 0) * (1 + 0.01 * torch.randn(64, 64))
+    same, other = (bench.system.compare(bench, of(moved, left), ideal).metrics for left in (0.0, 1e-3))
+    assert float(same["image_error_db"]) > -5 and float(other["image_error_db"]) < -20
+    assert float(same["amplitude_error_db"]) == float(other["amplitude_error_db"]) < -20
 
 
 def test_a_sweep_of_navigation_errors_and_noise_runs_in_one_batch(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from torchsar.io import read_history
 from torchsar.metrics import (
     contrast,
     entropy,
+    error_after_gain_db,
     error_db,
     impulse_response,
     line_of_sight_bound_m,
@@ -278,8 +279,9 @@ class AnyPath(System):
         "or added, and autofocus cannot observe slow phases; left out, as the error of the amplitudes, where an image "
         "differs from the reference by rounding only",
         "image_error_db": "10 lg of |g I - I0|^2 / |I0|^2 in dB of the complex samples, so that both errors count, "
-        "after the same registration with a complex gain g; in `trade`: of the windowed image of white noise seen "
-        "through the antenna, without registration, relative to the direct sum over the same pulses",
+        "with a complex gain g, as `requires` predicts it; after the same registration where the path or the phases of "
+        "pulses differ from those of the reference, since autofocus cannot observe a shift; in `trade`: of the "
+        "windowed image of white noise seen through the antenna, relative to the direct sum over the same pulses",
         "irw_azimuth_m": "median over the named points, as the other figures of responses; each point has its own in "
         "the tables of targets",
         "path_residual_rms_m": "rms over the pulses of half the path over the middle of the scene, recorded and "
@@ -375,9 +377,14 @@ class AnyPath(System):
             return judged
         count = len(judged.metrics["path_residual_rms_m"])
         errors = registered_errors(*(signal.data for signal in signals))
+        left, least = judged.view, None if ideal is None else ideal.judged.view
         # images that differ by rounding only have no errors to compare
         if bool((errors["image_error_db"] < -150).all()):
             errors = {"image_error_db": errors["image_error_db"]}
+        # a method that uses the path of the reference puts everything at its place
+        elif isinstance(left, Tensor) and isinstance(least, Tensor) and left.allclose(least, 0, 1e-9, equal_nan=True):
+            pair = torch.broadcast_tensors(*(signal.data for signal in signals))
+            errors["image_error_db"] = error_after_gain_db(*pair)
         return replace(judged, metrics={**judged.metrics, **{key: x.expand(count) for key, x in errors.items()}})
 
     def bounds(self, bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
