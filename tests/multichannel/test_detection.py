@@ -7,7 +7,7 @@ import torch
 
 from torchsar.core import Axis, Signal
 from torchsar.multichannel import detect
-from torchsar.multichannel.detection import contrast
+from torchsar.multichannel.chip import contrast
 
 AXES = (Axis("azimuth", 800, -400.0, 1.0, "m"), Axis("range", 64, 5000.0, 5.0, "m"))
 

@@ -14,8 +14,8 @@ from torchsar.repair import (
     blank_turning_points,
     circular_shift,
 )
-from torchsar.repair.analytic import delayed
 from torchsar.repair.triangle import canonical_ramps, split_record
+from torchsar.repair.trigger import delayed
 from torchsar.scene import EverySample, LadarWorld, Points, Polynomial
 from torchsar.study.bench.direct.triangles import ground, record, sweeps, table1
 

@@ -30,7 +30,7 @@ from torchsar.reproduce import (
     statement,
     verdict,
 )
-from torchsar.reproduce.record import entry, read, write
+from torchsar.reproduce.command import entry, read, write
 
 
 @pytest.mark.parametrize(

@@ -38,11 +38,11 @@ Most functions are stages of chains, too: `Reconstruct` calls `reconstruct`, and
 from torchsar.core.kinds import check_kinds
 from torchsar.multichannel.azimuth import (
     FocusAzimuth,
+    FocusPlan,
     focus_azimuth,
 )
 from torchsar.multichannel.balance import CorrectBalance, EstimateBalance, correct_balance, estimate_balance
-from torchsar.multichannel.chip import Extraction
-from torchsar.multichannel.detection import detect
+from torchsar.multichannel.chip import Extraction, detect
 from torchsar.multichannel.limits import multichannel_limits
 from torchsar.multichannel.migration import (
     CorrectMigration,
@@ -53,7 +53,6 @@ from torchsar.multichannel.migration import (
     correct_migration,
 )
 from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.plan import FocusPlan
 from torchsar.multichannel.reconstruct import (
     LeastSquares,
     MinimumMeanSquare,

@@ -32,10 +32,9 @@ from torchsar.core import (
     unit_phasor,
 )
 from torchsar.multichannel.balance_assess import assessed_balance
-from torchsar.multichannel.channels import ChannelStage, checked_channels, refuse_other_count
 from torchsar.multichannel.clutter_fit import ClutterModel, hann
 from torchsar.multichannel.migration import envelope_phasor
-from torchsar.multichannel.response import ElementPattern, Prior
+from torchsar.multichannel.response import ChannelStage, ElementPattern, Prior, checked_channels, refuse_other_count
 from torchsar.radar import BistaticRadar
 
 

@@ -21,10 +21,10 @@ from torch import Tensor
 
 from torchsar.core import Outcome, unit_level, worst
 from torchsar.core.fft import smooth_length
-from torchsar.multichannel.channels import checked_channels
 from torchsar.multichannel.chip import TINY, Chip, Extraction, Picture, chip_about
 from torchsar.multichannel.migration import Frame, envelope_phasor
 from torchsar.multichannel.motion import PointMotion
+from torchsar.multichannel.response import checked_channels
 from torchsar.multichannel.velocity.model import point_phasor
 
 

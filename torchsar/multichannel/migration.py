@@ -25,8 +25,8 @@ from torch.nn.functional import pad
 from torchsar.core import Signal, Stage, block_bytes_of, checked_samples, linear_phasor, per_trial, unit_phasor
 from torchsar.focus import keystone
 from torchsar.focus.nufft import nufft_type2
-from torchsar.multichannel.channels import refuse_shifted
 from torchsar.multichannel.motion import Number, PointMotion
+from torchsar.multichannel.response import refuse_shifted
 from torchsar.radar import BistaticRadar
 from torchsar.radar.bistatic import receive_range
 

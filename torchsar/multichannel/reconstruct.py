@@ -34,16 +34,18 @@ from torchsar.core import (
     linear_phasor,
     linear_solve,
 )
-from torchsar.multichannel.channels import ChannelStage, checked_channels, refuse_shifted
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.response import (
+    ChannelStage,
     ElementPattern,
     FlatBand,
     Prior,
     band_matrix,
+    checked_channels,
     doppler_centre_hz,
     doppler_offsets,
     first_bin,
+    refuse_shifted,
     shared_response,
 )
 from torchsar.radar import BistaticRadar

@@ -25,8 +25,7 @@ from torch import Tensor
 from torchsar.core import Estimate, Outcome, Signal, Stage, fft_lines, linear_phasor
 from torchsar.multichannel.balance import estimate_balance
 from torchsar.multichannel.body import Body, body_echo, body_image, find_body, known_body
-from torchsar.multichannel.chip import Extraction
-from torchsar.multichannel.detection import Detection, detect
+from torchsar.multichannel.chip import Detection, Extraction, detect
 from torchsar.multichannel.migration import Frame
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.reconstruct import LeastSquares, MinimumMeanSquare, Rebuild

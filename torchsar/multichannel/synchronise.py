@@ -25,8 +25,8 @@ from torch import Tensor
 
 from torchsar.core import Estimate, Outcome, Signal, Stage, matrix_inverse, unit_level, unit_phasor, worst
 from torchsar.multichannel.balance import without_errors
-from torchsar.multichannel.channels import ChannelStage, checked_channels, refuse_other_count
 from torchsar.multichannel.chip import TINY
+from torchsar.multichannel.response import ChannelStage, checked_channels, refuse_other_count
 from torchsar.radar import BistaticRadar
 
 

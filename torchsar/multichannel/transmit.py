@@ -18,8 +18,8 @@ from torch import Tensor
 from torchsar.core import Signal, Stage, checked_samples, per_trial, unit_phasor
 from torchsar.focus import range_compress
 from torchsar.focus.reference import REFERENCES
-from torchsar.multichannel.channels import ChannelStage, checked_channels
 from torchsar.multichannel.motion import Number, PointMotion
+from torchsar.multichannel.response import ChannelStage, checked_channels
 from torchsar.radar import BistaticRadar
 from torchsar.radar.bistatic import polynomial_range
 

@@ -53,9 +53,11 @@ from torchsar.repair.fill import (
 from torchsar.repair.interference import (
     DropInterference,
     NotchInterference,
+    RemovePulses,
     SubtractInterference,
     drop_interference,
     notch_interference,
+    remove_pulses,
     subtract_interference,
 )
 from torchsar.repair.jitter import (
@@ -64,11 +66,9 @@ from torchsar.repair.jitter import (
     Lagrange,
     correct_jitter,
 )
-from torchsar.repair.jitter_blind import BlindJitter, estimate_jitter_blind
-from torchsar.repair.jitter_pilot import PilotJitter, estimate_jitter_pilot
+from torchsar.repair.jitter_blind import BlindJitter, PilotJitter, estimate_jitter_blind, estimate_jitter_pilot
 from torchsar.repair.lines import LineIntegrity, line_integrity
 from torchsar.repair.placing import regular_lines
-from torchsar.repair.pulsed import RemovePulses, remove_pulses
 from torchsar.repair.response import CorrectResponse, correct_response
 from torchsar.repair.response_phase import (
     EstimateFlatResponse,

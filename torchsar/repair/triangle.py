@@ -40,8 +40,7 @@ from torch import Tensor
 
 from torchsar.core import Axis, Estimate, Signal, Stage, checked_samples, host_value
 from torchsar.radar import TriangularLadar
-from torchsar.repair.analytic import delayed
-from torchsar.repair.trigger import find_trigger
+from torchsar.repair.trigger import delayed, find_trigger
 
 
 def split_record(

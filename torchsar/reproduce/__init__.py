@@ -9,8 +9,7 @@ and the numbers that show it.
 
 from __future__ import annotations
 
-from torchsar.reproduce.catalogue import PAPERS, paper
-from torchsar.reproduce.command import reproduce, table
+from torchsar.reproduce.command import PAPERS, paper, reproduce, table
 from torchsar.reproduce.item import (
     BETTER,
     MISPRINT,

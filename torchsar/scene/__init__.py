@@ -40,7 +40,6 @@ because they decide shapes or choose a model.
 
 from torchsar.core.kinds import check_kinds
 from torchsar.core.show import show_briefly
-from torchsar.scene.aircraft import Aircraft, SpreadRows
 from torchsar.scene.bistatic import (
     BandLimited,
     BistaticWorld,
@@ -62,17 +61,15 @@ from torchsar.scene.flight import (
     Sway,
 )
 from torchsar.scene.fluctuation import LogAmplitude, MeasuredTrack, PathFluctuation, VibrationSpectrum
-from torchsar.scene.ladar import CalibrationFibre, LadarWorld
+from torchsar.scene.ladar import CalibrationFibre, LadarWorld, LetterE, RetroAndBrokenLine
 from torchsar.scene.ladar_range import EverySample, LinearInSweep, OnePerPeriod, OnePerSweep, QuadraticInSweep
-from torchsar.scene.ladar_targets import LetterE, RetroAndBrokenLine
 from torchsar.scene.movers import Fleet, GroundMovers, MovingPoints, Ship
 from torchsar.scene.path import MotionInSweep, PathWorld, PlaneGround, SideBeam
-from torchsar.scene.rotation import PolynomialRotation
-from torchsar.scene.satellite import Satellite
+from torchsar.scene.satellite import Aircraft, Satellite, SpreadRows
 from torchsar.scene.sea import ImageReflectivity, KSea
 from torchsar.scene.strip import AlwaysLit, Antenna, Dwell, Hyperbola, Parabola, StripmapWorld
 from torchsar.scene.targets import PointCloud, Points, RandomPoints, Scatterers, Scene, Speckle, Together
-from torchsar.scene.turntable import Dechirped, PhaseOnly, TurntableWorld
+from torchsar.scene.turntable import Dechirped, PhaseOnly, PolynomialRotation, TurntableWorld
 from torchsar.scene.vibration import Motion, Polynomial, Sinusoid, StartPhase, UniformStartPhase
 
 __all__ = [

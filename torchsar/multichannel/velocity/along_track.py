@@ -26,8 +26,8 @@ from torch import Tensor
 
 from torchsar.core import Estimate, Outcome, differentiable, unit_phasor
 from torchsar.core.fft import smooth_length
-from torchsar.multichannel.channels import checked_channels
 from torchsar.multichannel.motion import PointMotion
+from torchsar.multichannel.response import checked_channels
 from torchsar.multichannel.velocity.aperture import Aperture, Kept, seen_aperture
 from torchsar.multichannel.velocity.assess import outcome_of_point
 from torchsar.multichannel.velocity.model import (

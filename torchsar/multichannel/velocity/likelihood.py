@@ -16,8 +16,8 @@ from torch import Tensor
 
 from torchsar.core import take
 from torchsar.core.derivatives import is_differentiated
-from torchsar.multichannel.channels import checked_channels
 from torchsar.multichannel.motion import PointMotion
+from torchsar.multichannel.response import checked_channels
 from torchsar.multichannel.velocity.aperture import Aperture
 from torchsar.multichannel.velocity.model import (
     TINY,

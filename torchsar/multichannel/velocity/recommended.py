@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Estimate, Outcome, differentiable
-from torchsar.multichannel.channels import checked_channels
 from torchsar.multichannel.motion import Number, PointMotion
+from torchsar.multichannel.response import checked_channels
 from torchsar.multichannel.velocity.aperture import Aperture, Dwell, SeenAperture, seen_aperture
 from torchsar.multichannel.velocity.assess import outcome_of_point
 from torchsar.multichannel.velocity.bank import Search, bank_search

@@ -20,10 +20,9 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Estimate, Outcome, Signal, take
-from torchsar.multichannel.channels import ChannelStage
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.reconstruct import LeastSquares, Rebuild, check_condition, reconstruct, refuse_channels
-from torchsar.multichannel.response import doppler_offsets
+from torchsar.multichannel.response import ChannelStage, doppler_offsets
 from torchsar.multichannel.velocity.along_track import interfered
 from torchsar.multichannel.velocity.aperture import Dwell
 from torchsar.multichannel.velocity.assess import outcome_of_point

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Estimate, Outcome, Signal, Stage, take, unit_level
-from torchsar.multichannel.channels import checked_channels, refuse_shifted
 from torchsar.multichannel.motion import Number, PointMotion
+from torchsar.multichannel.response import checked_channels, refuse_shifted
 from torchsar.multichannel.velocity.along_track import along_track_velocity, interferometry
 from torchsar.multichannel.velocity.aperture import ELEMENT_BEAM, Aperture, Expected, seen_aperture
 from torchsar.multichannel.velocity.assess import outcome_of_point

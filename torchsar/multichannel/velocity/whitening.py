@@ -23,9 +23,8 @@ import torch
 from torch import Tensor
 
 from torchsar.core import cholesky_factor, matrix_inverse
-from torchsar.multichannel.channels import checked_channels
 from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.response import shared_response
+from torchsar.multichannel.response import checked_channels, shared_response
 from torchsar.radar import BistaticRadar
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torchsar.reproduce.geo import geometry, ocean, reconstruction, sensor, targets, text, velocity
+from torchsar.reproduce.geo import reconstruction, sensor, targets, velocity
 from torchsar.reproduce.item import Item, Paper, in_order
 
 __all__ = ["PAPER"]
@@ -15,6 +15,6 @@ PAPER = Paper(
         Item("Figure 1", "geometry of the observation", kind="diagram"),
         Item("Figure 9", "flow of the reconstruction", kind="diagram"),
         Item("Figure 13", "flow of the imaging of moving targets", kind="diagram"),
-        *(item for part in (sensor, geometry, targets, reconstruction, velocity, ocean, text) for item in part.ITEMS),
+        *(item for part in (sensor, targets, reconstruction, velocity) for item in part.ITEMS),
     ),
 )

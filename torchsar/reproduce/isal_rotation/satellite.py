@@ -33,8 +33,16 @@ from torchsar.focus import MatchedFourier
 from torchsar.focus.image_lines import mean_rate
 from torchsar.metrics import entropy, impulse_response
 from torchsar.radar import InverseRadar
-from torchsar.reproduce.isal_rotation.common import focused, in_metres, known_of, ladar, second_order
-from torchsar.reproduce.isal_rotation.profiles import OMEGA_RAD_S, SNR_DB, WARP_K
+from torchsar.reproduce.isal_rotation.profiles import (
+    OMEGA_RAD_S,
+    SNR_DB,
+    WARP_K,
+    focused,
+    in_metres,
+    known_of,
+    ladar,
+    second_order,
+)
 from torchsar.reproduce.item import Check, Item, falling, misprint, number, seeds_of, statement
 from torchsar.scene import PolynomialRotation, Satellite, TurntableWorld
 

@@ -32,7 +32,7 @@ from torchsar.focus import MatchedFourier
 from torchsar.focus.image_lines import mean_rate
 from torchsar.metrics import entropy, rotation_bounds
 from torchsar.radar import InverseRadar
-from torchsar.reproduce.isal_rotation.common import focused, in_metres, known_of, ladar
+from torchsar.reproduce.isal_rotation.profiles import focused, in_metres, known_of, ladar
 from torchsar.reproduce.isal_rotation.satellite import TIP_M
 from torchsar.reproduce.item import Check, Fact, Item, Made, falling, number, seeds_of
 from torchsar.scene import PolynomialRotation, Satellite, TurntableWorld

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from torchsar.reproduce.item import Check, Item, Paper, given, in_order, number, statement
-from torchsar.reproduce.sal import ground, isolated, letter, points
+from torchsar.reproduce.sal import ground, points
 
 __all__ = ["PAPER"]
 __dir__ = __all__.copy
@@ -26,9 +26,7 @@ PAPER = Paper(
         Item("Figure 13", "geometry of the observation", kind="diagram"),
         Item("Figure 14", "the instrument, the laboratory and the target", kind="photograph"),
         *points.ITEMS,
-        *letter.ITEMS,
         *ground.ITEMS,
-        *isolated.ITEMS,
         given(
             "Text 1",
             "range cell (sections 3.1 and 3.3)",
