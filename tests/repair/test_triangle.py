@@ -144,7 +144,7 @@ def test_circular_shift_joins_samples_one_period_apart():
     radar, trigger = table1(), 6e-6
     x = record(radar, trigger, 4, motion=lambda t: 0.3 * t)
     shifted = CircularShift(radar, trigger)(signal_of(radar, x)).data
-    assert torch.equal(shifted, circular_shift(x, trigger, radar))
+    assert torch.equal(shifted, circular_shift(x, radar, trigger))
     joint = 1024 - 384
     steps = torch.angle(shifted[:, 1:] * shifted[:, :-1].conj()) / (2 * torch.pi)
     jump = steps[:, joint - 1] - steps[:, joint + 1]

@@ -317,7 +317,6 @@ FUNCTIONS = [
             ),
         ),
     ),
-    _entry("repair.circular_shift", "record", lambda x: repair.circular_shift(x, 3.3e-6, LADAR), laws=Laws(energy=1)),
     _entry(
         "repair.triangle.split_record",
         "record",
@@ -359,15 +358,6 @@ FUNCTIONS = [
         laws=Laws(energy=1),
     ),
     _entry("repair.remove_constant", "raw", repair.remove_constant),
-    _entry("repair.remove_pulses", "raw", repair.remove_pulses, laws=Laws(linear="finds the parts that are hit")),
-    _entry("repair.remove_tones", "raw", repair.remove_tones, laws=Laws(linear="finds tones")),
-    _entry(
-        "repair.balance_quadrature",
-        "raw",
-        repair.balance_quadrature,
-        {"data": 1, "0": 1},
-        laws=Laws(phase="I and Q are told apart"),
-    ),
     _entry("repair.drop_interference", "raw", repair.drop_interference),
     _entry("repair.notch_interference", "raw", repair.notch_interference),
     _entry("repair.subtract_interference", "raw", repair.subtract_interference),

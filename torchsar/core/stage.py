@@ -98,14 +98,15 @@ class Stage(nn.Module):
         >>> louder(line, {"given.f": torch.tensor(2.0)}).data.real
         tensor([2., 2.])
 
-        The first parameter of the function takes the samples. Parameters with a default are those
-        of the constructor; the others are values of the call, which a chain connects by `use`, as
-        it can those not given to the constructor. A tensor that the function returns holds the new
-        samples.
+        The first parameter of the function takes the samples. Parameters with a default, and those
+        that are annotated as no tensor, such as a radar, are those of the constructor; the others
+        are values of the call, which a chain connects by `use`, as it can those not given to the
+        constructor. A tensor that the function returns holds the new samples; an Estimate may
+        follow it.
 
         Args:
-            function: Function of samples, shape (..., and the axes), which returns samples or an
-                Estimate.
+            function: Function of samples, shape (..., and the axes), which returns samples, an
+                Estimate, or both.
             **attributes: Attributes of the stage, such as `works_on` and `provides`.
 
         Returns:
@@ -117,17 +118,22 @@ class Stage(nn.Module):
         def forward(self: Any, signal: Signal, *args: Any, **values: Any) -> Any:
             held = {name: getattr(self, name) for name in self.constants}
             found = function(signal.data, *args, **{**held, **values})
-            return signal.with_data(found.contiguous()) if isinstance(found, Tensor) else found
+            data, *rest = found if isinstance(found, tuple) else (found,)
+            made = signal.with_data(data.contiguous()) if isinstance(data, Tensor) else data
+            return (made, *rest) if rest else made
 
-        constructor = inspect.Signature([p for p in accepted if p.default is not p.empty])
+        def fixed(p: inspect.Parameter) -> bool:
+            return p.default is not p.empty or (p.annotation is not p.empty and "Tensor" not in str(p.annotation))
+
+        constructor = inspect.Signature([p for p in accepted if fixed(p)])
 
         def init(self: Any, *args: Any, **constants: Any) -> None:
             super(made, self).__init__()
             self.constants = constructor.bind(*args, **constants).arguments
             self.connects = [p for p in accepted if p.name not in self.constants]
             for name, value in self.constants.items():
-                fixed = isinstance(value, Tensor) and not isinstance(value, nn.Parameter)
-                (self.register_buffer if fixed else functools.partial(setattr, self))(name, value)
+                held = isinstance(value, Tensor) and not isinstance(value, nn.Parameter)
+                (self.register_buffer if held else functools.partial(setattr, self))(name, value)
 
         init.__annotations__, init.__wrapped__ = function.__annotations__, function  # pyright: ignore
         called = [inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in ("self", "signal")]

@@ -154,30 +154,7 @@ def remove_tones(x: Tensor, count: int = 4, least_excess: float = 20.0) -> Tenso
     return x * level
 
 
-class RemoveTones(Stage):
-    """Stage that subtracts spurs of the receiver; see `remove_tones`.
-
-    Args:
-        count: Largest number of tones, of each channel and each sweep.
-        least_excess: Least power of a tone over the other cells of its frequencies.
-    """
-
-    also_on = _ALSO_ON
-
-    def __init__(self, count: int = 4, least_excess: float = 20.0) -> None:
-        super().__init__()
-        self.count, self.least_excess = count, least_excess
-
-    def forward(self, signal: Signal) -> Signal:
-        """Subtract the tones.
-
-        Args:
-            signal: Samples of the axes (pulse, range), or of a ladar or several channels.
-
-        Returns:
-            Signal of the same axes.
-        """
-        return signal.with_data(remove_tones(signal.data, self.count, self.least_excess))
+RemoveTones = Stage.of(remove_tones, also_on=_ALSO_ON)
 
 
 @differentiable("where ok")
@@ -242,21 +219,6 @@ def balance_quadrature(x: Tensor) -> tuple[Tensor, Estimate]:
     return torch.complex(x.real, q), found
 
 
-class BalanceQuadrature(Stage):
-    """Stage that removes unequal gain and phase of I and Q; see `balance_quadrature`."""
-
-    provides = ("gain_db", "phase_deg")
-    neutral = {"gain_db": 0.0, "phase_deg": 0.0}
-    differentiable = "where ok"
-
-    def forward(self, signal: Signal) -> tuple[Signal, Estimate]:
-        """Balance the components.
-
-        Args:
-            signal: Samples of the axes (pulse, range), without a constant.
-
-        Returns:
-            The balanced signal, and the estimate of the errors that were removed.
-        """
-        data, found = balance_quadrature(signal.data)
-        return signal.with_data(data), found
+BalanceQuadrature = Stage.of(
+    balance_quadrature, provides=("gain_db", "phase_deg"), neutral={"gain_db": 0.0, "phase_deg": 0.0}
+)

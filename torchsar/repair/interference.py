@@ -406,25 +406,4 @@ def remove_pulses(raw: Tensor, parts: int = 32, threshold: float = 3.0) -> Tenso
     return torch.where(hit.repeat_interleave(length, -1)[..., :n], filled, raw)
 
 
-class RemovePulses(Stage):
-    """Stage that removes pulses of another radar; see `remove_pulses`.
-
-    Args:
-        parts: Number of parts of a line.
-        threshold: Least power of a part over the median of the lines nearby.
-    """
-
-    def __init__(self, parts: int = 32, threshold: float = 3.0) -> None:
-        super().__init__()
-        self.parts, self.threshold = parts, threshold
-
-    def forward(self, signal: Signal) -> Signal:
-        """Fill the parts of lines that pulses hit.
-
-        Args:
-            signal: Raw lines, axes (pulse, range).
-
-        Returns:
-            The corrected signal.
-        """
-        return signal.with_data(remove_pulses(signal.data, self.parts, self.threshold))
+RemovePulses = Stage.of(remove_pulses)

@@ -205,14 +205,14 @@ def _taken(lines: Tensor, start: Tensor, n: int) -> Tensor:
     return lines.expand(*shape, *lines.shape[-2:]).gather(-1, index.expand(*shape, lines.shape[-2], n))
 
 
-def circular_shift(record: Tensor, shift_s: float, radar: TriangularLadar) -> Tensor:
+def circular_shift(record: Tensor, radar: TriangularLadar, shift_s: float) -> Tensor:
     """Shift the samples of each period circularly, as published; for comparisons only.
 
     >>> import torch
     >>> from torchsar import radar, repair
     >>> ladar = radar.TriangularLadar(2e14, 5e9, 16e-6, 64e6, 60.0, 3000.0)
     >>> record = torch.arange(2048.0).reshape(2, 1024)  # two periods
-    >>> repair.circular_shift(record, 2 / ladar.sample_rate_hz, ladar)[:, [0, -1]].tolist()
+    >>> repair.circular_shift(record, ladar, 2 / ladar.sample_rate_hz)[:, [0, -1]].tolist()
     [[2.0, 1.0], [1026.0, 1025.0]]
 
     Samples that are one period apart become neighbours, which makes a phase step of 2 pi fd period
@@ -222,8 +222,8 @@ def circular_shift(record: Tensor, shift_s: float, radar: TriangularLadar) -> Te
 
     Args:
         record: Record, shape (..., pulse, time), real or complex.
-        shift_s: Shift to earlier times in seconds, rounded to whole samples.
         radar: Ladar parameters.
+        shift_s: Shift to earlier times in seconds, rounded to whole samples.
 
     Returns:
         Record of the same shape.
@@ -425,34 +425,4 @@ class BlankTurningPoints(Stage):
         )
 
 
-class CircularShift(Stage):
-    """Stage that shifts the samples of each period circularly; see `circular_shift`.
-
-    For comparisons only. The shift aligns the start of the triangles with the start of the blocks;
-    `SplitSweeps(radar, 0.0)` then separates the sweeps.
-
-    Args:
-        radar: Ladar parameters.
-        shift_s: Shift to earlier times in seconds, rounded to whole samples.
-
-    Reference:
-        Remote Sens. 2024, 16, 793, Fig. 15b.
-    """
-
-    works_on = ("pulse", "time")
-    takes_real = True
-
-    def __init__(self, radar: TriangularLadar, shift_s: float) -> None:
-        super().__init__()
-        self.radar, self.shift_s = radar, shift_s
-
-    def forward(self, signal: Signal) -> Signal:
-        """Shift the samples of each period circularly to earlier times; see `circular_shift`.
-
-        Args:
-            signal: Record, shape (..., pulse, time), real or complex.
-
-        Returns:
-            Record of the same shape.
-        """
-        return signal.with_data(circular_shift(signal.data, self.shift_s, self.radar))
+CircularShift = Stage.of(circular_shift, works_on=("pulse", "time"), takes_real=True)

@@ -300,9 +300,7 @@ def _equation_13() -> Check:
     return misprint("second term of the range error, Eq. (13)", "1.6e-3 m", second < 0.5e-3, ours)
 
 
-# items in the order of the paper
-
-
+# items by figures, tables and numbers of the text
 ITEMS = (
     Item(
         "Table 2",

@@ -297,9 +297,7 @@ TIMES = (
     "Newton's method here finds its second derivatives by automatic differentiation: one of its steps takes as long as "
     "{step:.0f} images, {steps:.0f} steps reach the minimum, and the genetic algorithm forms 170 images"
 )
-# items in the order of the paper
-
-
+# items by figures, tables and numbers of the text
 ITEMS = (
     Item("Figure 18", "photograph of the corner cubes", kind="photograph"),
     Item(
