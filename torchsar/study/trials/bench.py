@@ -254,7 +254,11 @@ class Bench:
             key: rows(x.abs() if x.is_complex() else x, trials.count).detach().double().mean(1)
             for key, x in trace.metrics.items()
         }
-        judged = replace(judged, metrics={"seconds": spent, **verdict(codes), **judged.metrics, **measured})
+        own, *targets = (
+            {key: x.expand(trials.count) for key, x in of.items()} for of in (judged.metrics, *judged.targets.values())
+        )
+        metrics = {"seconds": spent, **verdict(codes), **own, **measured}
+        judged = replace(judged, metrics=metrics, targets=dict(zip(judged.targets, targets)))
         left = [stage for stage in trace.inputs if trace.outputs[stage] is trace.inputs[stage]]
         used = {"neutral": trace.neutral, "doubtful": trace.doubtful}
         used = {kind: {key: rows(x, trials.count).any(1) for key, x in of.items()} for kind, of in used.items()}

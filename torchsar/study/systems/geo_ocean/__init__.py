@@ -366,7 +366,6 @@ class GeoOcean(System):
             whole |= verdict({"ships": Outcome.of(found, Outcome.NOISE), **others})
         if not detail:
             whole |= {f"{ship}.{key}": x for ship, of in ships.items() for key, x in of.items() if key != OK}
-        whole = {key: value.expand(trials.count) for key, value in whole.items()}
         changed = [n for n in trace.outputs if n != last and trace.outputs[n] is not trace.inputs[n]] if detail else []
         steps = {n: image_of(trace.outputs[n]) for n in changed}
         return Judged(whole, ships, view=View(made, views, steps))

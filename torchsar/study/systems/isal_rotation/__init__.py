@@ -213,13 +213,13 @@ class IsalRotation(System):
         metrics |= {"evaluations": torch.stack([x.expand(count) for x in seen]).sum(0)} if seen else {}
         rate = _scale_rate(found, truth, duration_s, bench.radar.rotation_rad_s, count)
         if trace.signal.names != IMAGE:
-            return Judged(_expanded(metrics, count), view=View(rate, {}))
+            return Judged(metrics, view=View(rate, {}))
         metrics |= {"entropy_nats": entropy(trace.signal), "contrast": contrast(trace.signal)}
         named = bench.world().named_points if detail else {}
         cuts = {target: self._cut(bench, name, trace, truth, i, rate) for target, i in named.items()}
         shown = {target: cut for target, cut in cuts.items() if cut is not None}
         targets = {target: cut.figures for target, cut in shown.items()}
-        return Judged(_expanded(metrics, count), targets, [n for n in cuts if n not in shown], View(rate, shown))
+        return Judged(metrics, targets, [n for n in cuts if n not in shown], View(rate, shown))
 
     def _cut(
         self, bench: Bench, name: str, trace: Trace, truth: Mapping[str, Tensor], target: int, rate: Tensor
@@ -282,10 +282,6 @@ class IsalRotation(System):
             if trapped:
                 text = "On the grid of these images, wrong rotations give less entropy than the true one: "
                 yield f"Misleading entropy, case {case}", f"{text}{', '.join(trapped)}. A finer grid prevents this."
-
-
-def _expanded(metrics: Mapping[str, Tensor], count: int) -> dict[str, Tensor]:
-    return {name: value.expand(count) for name, value in metrics.items()}
 
 
 def _scale_rate(

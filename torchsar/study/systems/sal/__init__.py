@@ -51,7 +51,7 @@ from torchsar.study.names.registry import (
 )
 from torchsar.study.settings.errors import ConfigError, did_you_mean
 from torchsar.study.systems.sal import choices, figures
-from torchsar.study.systems.sal.judge import Course, course_of, target_responses
+from torchsar.study.systems.sal.judge import course_of, target_responses
 from torchsar.study.trials import system
 from torchsar.study.trials.batch import IMAGE, Batch, Judged, Trials
 from torchsar.study.trials.bench import Bench
@@ -272,7 +272,7 @@ class Sal(System):
         course = course_of(bench.chains[name], trace, trials.truth, bench.radar, clean)
         metrics = course.metrics(bench.radar)
         if trace.signal.names != IMAGE:
-            return _expanded(metrics, {}, (), course, trials.count)
+            return Judged(metrics, view=course)
         metrics |= {"entropy_nats": entropy(trace.signal), "contrast": contrast(trace.signal, of="amplitude")}
         truth, named = trials.truth, bench.world().named_points
         at = {
@@ -289,7 +289,7 @@ class Sal(System):
         )
         shown = targets.get(settings.target or "", {})
         metrics |= {key: value for key, value in shown.items() if key.startswith(("irw", "pslr", "islr"))}
-        return _expanded(metrics, targets, [t for t in named if t not in targets], course, trials.count)
+        return Judged(metrics, targets, [t for t in named if t not in targets], course)
 
     def bounds(self, bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
         """Return lower bounds of the errors of velocity (m/s) and range (m) for a scene of one
@@ -335,14 +335,6 @@ class Sal(System):
                     f"{', '.join(wrong)}. Compare methods by the residual phase, not by entropy alone."
                 )
                 yield f"Misleading entropy, case {case}", text
-
-
-def _expanded(
-    metrics: Mapping[str, Tensor], targets: Mapping[str, Any], outside: Sequence[str], course: Course, count: int
-) -> Judged:
-    """Expand metrics to one entry per trial, also if all trials have the same value."""
-    rows = {name: {key: value.expand(count) for key, value in of.items()} for name, of in targets.items()}
-    return Judged({key: value.expand(count) for key, value in metrics.items()}, rows, outside, course)
 
 
 SYSTEM = Sal
