@@ -302,51 +302,12 @@ def _slope(weights: Tensor, position: Tensor, reference: int) -> Tensor:
     return coarse + (counts * angle * f).sum(-2) / (counts * f.square()).sum(-2)
 
 
-class EstimateBalance(Stage):
-    """Stage that estimates phase, gain and delay of each channel; see `estimate_balance`.
-
-    The values connect to `CorrectBalance`.
-
-    Args:
-        radar: Radar parameters.
-        prior: Expected power of the clutter over Doppler, `ElementPattern()` by default.
-        bands: Number of Doppler bands that the clutter fills, each one PRF wide; None for all at
-            which a stationary scene has echoes.
-        delays: False to assume zero delays.
-        blocks: Number of parts into which the range band is divided; within each part a delay is
-            approximated by a constant phase.
-        assess: Whether standard deviations, quality and outcome are assessed.
-    """
-
-    works_on = ("channel", "pulse", "range")
-    provides = ("phase_rad", "gain_db", "delay_s")
-    neutral = {"phase_rad": 0.0, "gain_db": 0.0, "delay_s": 0.0}
-    differentiable = "no"
-
-    def __init__(
-        self,
-        radar: BistaticRadar,
-        prior: Prior | None = None,
-        bands: int | None = None,
-        delays: bool = True,
-        blocks: int = 16,
-        *,
-        assess: bool = True,
-    ) -> None:
-        super().__init__()
-        self.radar, self.settings, self.assess = radar, (prior, bands, delays, blocks), assess
-
-    def forward(self, signal: Signal) -> Estimate:
-        """Estimate phase, gain and delay of each channel from stationary clutter.
-
-        Args:
-            signal: Range-compressed channels with the axes (channel, pulse, range) and the transmit
-                range removed from the phase.
-
-        Returns:
-            `phase_rad`, `gain_db` and `delay_s` of shape (..., channel), see `estimate_balance`.
-        """
-        return estimate_balance(signal.data, self.radar, *self.settings, assess=self.assess)
+EstimateBalance = Stage.of(
+    estimate_balance,
+    works_on=("channel", "pulse", "range"),
+    provides=("phase_rad", "gain_db", "delay_s"),
+    neutral={"phase_rad": 0.0, "gain_db": 0.0, "delay_s": 0.0},
+)
 
 
 class CorrectBalance(ChannelStage):

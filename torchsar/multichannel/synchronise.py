@@ -23,7 +23,17 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Outcome, Signal, Stage, matrix_inverse, unit_level, unit_phasor, worst
+from torchsar.core import (
+    Estimate,
+    Outcome,
+    Signal,
+    Stage,
+    differentiable,
+    matrix_inverse,
+    unit_level,
+    unit_phasor,
+    worst,
+)
 from torchsar.multichannel.balance import without_errors
 from torchsar.multichannel.chip import TINY
 from torchsar.multichannel.response import ChannelStage, checked_channels, refuse_other_count
@@ -105,7 +115,8 @@ def _refined_delay(band: Tensor, frequency: Tensor, start: Tensor, steps: int = 
     return delay
 
 
-def estimate_clutter_synchronisation(
+@differentiable("no")
+def clutter_synchronisation(
     data: Tensor,
     radar: BistaticRadar,
     band_hz: float,
@@ -116,12 +127,23 @@ def estimate_clutter_synchronisation(
 ) -> Estimate:
     """Estimate the clock phase and delay of each pulse from the echo of scatterers at rest.
 
+    >>> from torchsar import Draws, echo, multichannel, radar, scene
+    >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)
+    >>> world = scene.BistaticWorld(None, scene.BandLimited(1.0), scene.KSea(), snr_db=40.0)
+    >>> drift = {"clock": echo.SynchronisationError(phase_rad=[0.0, 0.0, 20.0])}
+    >>> sea, truth = echo.simulate_bistatic(receiver, world, 90, 64, Draws(1), impairments=drift)
+    >>> found = multichannel.ClutterSynchronisation(receiver, 90.0)(sea.signal)["phase_rad"]
+    >>> true = truth.values["clock.phase_rad"]
+    >>> bool((found - true).std() < 0.1 * true.std())
+    True
+
     Every range cell is weighted, in blocks of slow time, by how well each pulse predicts the next
     one. Bright places at rest, such as islands and ships at anchor, have the most weight, but a sea
     far above the noise contributes as well. Cells in which something moves are badly predicted and
     have hardly any weight. A constant phase cannot be determined, and a phase that grows linearly
     with time displaces the whole scene along track: both are left out, and so is a constant delay.
-    Not differentiable.
+    Not differentiable. The stage follows the balance of the channels, and the stage that uses it is
+    connected as `use(RemoveSynchronisation(radar), phase_rad="clock", delay_s="clock")`.
 
     Args:
         data: Range-compressed, balanced channels with the transmit range removed from the phase,
@@ -145,11 +167,11 @@ def estimate_clutter_synchronisation(
             of the radar. Also if the radar has one channel, there are fewer than 4 pulses, or
             `band_hz` or `block_s` is not positive.
     """
-    data = checked_channels(data, radar, "estimate_clutter_synchronisation", "channel, pulse, range")
+    data = checked_channels(data, radar, "clutter_synchronisation", "channel, pulse, range")
     pulses = data.shape[-2]
     if radar.channels < 2 or pulses < 4:
         raise ValueError(
-            "estimate_clutter_synchronisation compares channels in successive pulses, and needs at least 2 channels "
+            "clutter_synchronisation compares channels in successive pulses, and needs at least 2 channels "
             f"and 4 pulses, got {radar.channels} and {pulses}"
         )
     if not (band_hz > 0 and block_s > 0):
@@ -341,49 +363,12 @@ class EstimateSynchronisation(ChannelStage):
         return estimate_synchronisation(direct_path, self.radar, assess=self.assess)
 
 
-class ClutterSynchronisation(Stage):
-    """Stage that estimates clock phases and delays from the echo of scatterers at rest.
-
-    >>> from torchsar import Draws, echo, multichannel, radar, scene
-    >>> receiver = radar.BistaticRadar(1.25e9, radar.LinearFM(50e6, 10e-6), 60e6, 180, 300, 5000)
-    >>> world = scene.BistaticWorld(None, scene.BandLimited(1.0), scene.KSea(), snr_db=40.0)
-    >>> drift = {"clock": echo.SynchronisationError(phase_rad=[0.0, 0.0, 20.0])}
-    >>> sea, truth = echo.simulate_bistatic(receiver, world, 90, 64, Draws(1), impairments=drift)
-    >>> found = multichannel.ClutterSynchronisation(receiver, 90.0)(sea.signal)["phase_rad"]
-    >>> true = truth.values["clock.phase_rad"]
-    >>> bool((found - true).std() < 0.1 * true.std())
-    True
-
-    See `estimate_clutter_synchronisation`. It follows the balance of the channels, and the stage
-    that uses it is connected as `use(RemoveSynchronisation(radar), phase_rad="clock",
-    delay_s="clock")`.
-
-    Args:
-        radar: Radar parameters.
-        band_hz: Doppler bandwidth in Hz of what is at rest, about zero.
-        block_s: Length in seconds of the blocks in which range cells are compared.
-        snr_db: Power of what is at rest over the noise in dB, for the prediction.
-        assess: Whether quality and outcome are assessed.
-    """
-
-    works_on = ("channel", "pulse", "range")
-    provides = ("phase_rad", "delay_s")
-    neutral = {"phase_rad": 0.0, "delay_s": 0.0}
-    differentiable = "no"
-
-    def __init__(
-        self, radar: BistaticRadar, band_hz: float, block_s: float = 0.25, snr_db: float = 30.0, *, assess: bool = True
-    ) -> None:
-        super().__init__()
-        self.radar, self.settings, self.assess = radar, (band_hz, block_s, snr_db), assess
-
-    def forward(self, signal: Signal) -> Estimate:
-        """Estimate phase and delay of each pulse of channels with the axes (channel, pulse, range).
-
-        Returns:
-            `phase_rad` and `delay_s` of shape (..., pulse), see `estimate_clutter_synchronisation`.
-        """
-        return estimate_clutter_synchronisation(signal.data, self.radar, *self.settings, assess=self.assess)
+ClutterSynchronisation = Stage.of(
+    clutter_synchronisation,
+    works_on=("channel", "pulse", "range"),
+    provides=("phase_rad", "delay_s"),
+    neutral={"phase_rad": 0.0, "delay_s": 0.0},
+)
 
 
 class RemoveSynchronisation(ChannelStage):
