@@ -8,7 +8,7 @@ about 7.2.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -82,20 +82,16 @@ def _draw(seen: _Seen, case: str, names: tuple[str, ...], path: Path) -> None:
     plot.save(plot.images(rolled, dynamic_range_db=35.0), path, columns=3)
 
 
-def _images(case: str, sharp: tuple[str, ...], blurred: tuple[str, ...]) -> Callable[[_Seen, Path], list[Check]]:
+def _images(case: str, sharp: tuple[str, ...], blurred: tuple[str, ...], seen: _Seen, path: Path) -> list[Check]:
     """A figure of images, some of them focused and the others not."""
-
-    def make(seen: _Seen, path: Path) -> list[Check]:
-        _draw(seen, case, tuple(name for name in METHODS if name in (*sharp, *blurred, "recommended")), path)
-        checks = []
-        for name in (*sharp, *blurred):
-            above = seen.above(case, METHODS[name])
-            claim, holds = ("focused", above < FOCUSED) if name in sharp else ("defocused", above > DEFOCUSED)
-            count = len(seen.entropies(case, "ideal"))
-            checks.append(statement(name, claim, holds, f"{above:.2f} nats above the error-free image", count))
-        return checks
-
-    return make
+    _draw(seen, case, tuple(name for name in METHODS if name in (*sharp, *blurred, "recommended")), path)
+    checks = []
+    for name in (*sharp, *blurred):
+        above = seen.above(case, METHODS[name])
+        claim, holds = ("focused", above < FOCUSED) if name in sharp else ("defocused", above > DEFOCUSED)
+        count = len(seen.entropies(case, "ideal"))
+        checks.append(statement(name, claim, holds, f"{above:.2f} nats above the error-free image", count))
+    return checks
 
 
 def _figure_2(seen: _Seen, path: Path) -> list[Check]:
@@ -184,26 +180,26 @@ PAPER = Paper(
             "Figure 3",
             "images with a vibration of low frequency, 1_0.1_90",
             of=_cases,
-            make=_images("1_0.1_90", ("PGA", "PGA-SCA"), ("polluted", "SCA")),
+            make=partial(_images, "1_0.1_90", ("PGA", "PGA-SCA"), ("polluted", "SCA")),
         ),
         Item(
             "Figure 4",
             "images with a vibration of high frequency, 1_100_90",
             of=_cases,
-            make=_images("1_100_90", ("PGA-SCA",), ("polluted", "PGA", "SCA")),
+            make=partial(_images, "1_100_90", ("PGA-SCA",), ("polluted", "PGA", "SCA")),
         ),
         Item("Figure 5", "random phase errors and the polluted image", of=_cases, make=_figure_5),
         Item(
             "Figure 6",
             "images with random phase errors",
             of=_cases,
-            make=_images("sigma 2 pi", ("PGA-SCA",), ("PGA", "SCA")),
+            make=partial(_images, "sigma 2 pi", ("PGA-SCA",), ("PGA", "SCA")),
         ),
         Item(
             "Figure 7",
             "images with a vibration and random phase errors",
             of=_cases,
-            make=_images("1_100_60, sigma pi", ("PGA-SCA",), ("polluted", "PGA", "SCA")),
+            make=partial(_images, "1_100_60, sigma pi", ("PGA-SCA",), ("polluted", "PGA", "SCA")),
         ),
         Item(
             "Table 1",

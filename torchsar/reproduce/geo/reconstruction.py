@@ -19,8 +19,9 @@ source prints azimuth on x = (V_R - u_a) t of each target.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -143,16 +144,12 @@ def _closing(small: bool) -> Closing:
     return data, (torch.linspace(0, 20, 41 if small else 201, dtype=torch.float64))
 
 
-def _rebuilt(gate: str) -> Callable[[Closing, Path], list[Check]]:
+def _rebuilt(gate: str, seen: Closing, path: Path) -> list[Check]:
     """Make figure 10 or 11: the share of the power near the centroid for each assumed velocity."""
-
-    def make(seen: Closing, path: Path) -> list[Check]:
-        _draw_spectra(seen[0][gate], path)
-        ratios = _ratios_db(_intensity(seen[0][gate], torch.tensor(GUESSES_M_S, dtype=torch.float64)))["Gamma1"]
-        levels = {f"{guess:g} m/s": float(ratio) for guess, ratio in zip(GUESSES_M_S, ratios, strict=True)}
-        return [falling("power inside over outside the processed band (dB)", levels, rising=True)]
-
-    return make
+    _draw_spectra(seen[0][gate], path)
+    ratios = _ratios_db(_intensity(seen[0][gate], torch.tensor(GUESSES_M_S, dtype=torch.float64)))["Gamma1"]
+    levels = {f"{guess:g} m/s": float(ratio) for guess, ratio in zip(GUESSES_M_S, ratios, strict=True)}
+    return [falling("power inside over outside the processed band (dB)", levels, rising=True)]
 
 
 def _figure_12(seen: Closing, path: Path) -> list[Check]:
@@ -315,8 +312,13 @@ def _figure_18(seen: _Seen, path: Path) -> list[Check]:
 
 
 ITEMS = (
-    Item("Figure 10", "spectra rebuilt with wrong and right velocities", of=_closing, make=_rebuilt("band-limited")),
-    Item("Figure 11", "the same through the antenna pattern", of=_closing, make=_rebuilt("pattern")),
+    Item(
+        "Figure 10",
+        "spectra rebuilt with wrong and right velocities",
+        of=_closing,
+        make=partial(_rebuilt, "band-limited"),
+    ),
+    Item("Figure 11", "the same through the antenna pattern", of=_closing, make=partial(_rebuilt, "pattern")),
     Item("Figure 12", "signal intensity ratios over the velocity", of=_closing, make=_figure_12),
     Item("Figure 17", "largest false target over the velocity", _over_velocity, _figure_17),
     Item("Figure 18", "moving ships on a sea", of=_sea, make=_figure_18),

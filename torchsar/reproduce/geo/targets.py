@@ -10,8 +10,9 @@ axis c tau / 2, half of the receive path; azimuth is x = v t. Nothing here is ra
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -301,28 +302,24 @@ def _targets(small: bool) -> Seen:
     return batch, {method: _products(batch, method) for method in PUBLISHED}
 
 
-def _figure(name: str, method: str) -> Callable[[Seen, Path], list[Check]]:
+def _figure(name: str, method: str, seen: Seen, path: Path) -> list[Check]:
     """Make the figure of one target by one method, and describe its width, PSLR and false
     targets.
     """
-
-    def make(seen: Seen, path: Path) -> list[Check]:
-        trial, (u_r, u_a) = list(SPEEDS).index(name), SPEEDS[name]
-        two = seen[1][method][0]
-        blurred = method == "conventional" and u_a != 0
-        _draw_target(two, trial, f"({u_r:g}, {u_a:g}) m/s, {method}", path, 60.0 if blurred else 15.0)
-        width, false = (float(_measured(seen[0], two)[trial, which]) for which in (0, -1))
-        focused, clean = width < 1, false < -40
-        claim = "focused, without false targets"
-        if method == "conventional" and u_a:
-            claim, holds = "strongly defocused in azimuth", not focused
-        elif method == "conventional" and u_r:
-            claim, holds = "false targets at a high level", not clean
-        else:
-            holds = focused and clean
-        return [statement("point", claim, holds, f"width {width:.2f} m, false targets {false:.1f} dB")]
-
-    return make
+    trial, (u_r, u_a) = list(SPEEDS).index(name), SPEEDS[name]
+    two = seen[1][method][0]
+    blurred = method == "conventional" and u_a != 0
+    _draw_target(two, trial, f"({u_r:g}, {u_a:g}) m/s, {method}", path, 60.0 if blurred else 15.0)
+    width, false = (float(_measured(seen[0], two)[trial, which]) for which in (0, -1))
+    focused, clean = width < 1, false < -40
+    claim = "focused, without false targets"
+    if method == "conventional" and u_a:
+        claim, holds = "strongly defocused in azimuth", not focused
+    elif method == "conventional" and u_r:
+        claim, holds = "false targets at a high level", not clean
+    else:
+        holds = focused and clean
+    return [statement("point", claim, holds, f"width {width:.2f} m, false targets {false:.1f} dB")]
 
 
 def _table_4(seen: Seen, path: Path) -> Made:
@@ -353,11 +350,16 @@ def _table_4(seen: Seen, path: Path) -> Made:
 
 
 ITEMS = (
-    Item("Figure 5", "a target at rest", of=_targets, make=_figure("at rest", "conventional")),
-    Item("Figure 6", "a target that moves along track, as if at rest", of=_targets, make=_figure("P1", "conventional")),
-    Item("Figure 7", "a target that closes, as if at rest", of=_targets, make=_figure("P2", "conventional")),
-    Item("Figure 14", "a target that moves along track", of=_targets, make=_figure("P1", "proposed")),
-    Item("Figure 15", "a target that closes", of=_targets, make=_figure("P2", "proposed")),
+    Item("Figure 5", "a target at rest", of=_targets, make=partial(_figure, "at rest", "conventional")),
+    Item(
+        "Figure 6",
+        "a target that moves along track, as if at rest",
+        of=_targets,
+        make=partial(_figure, "P1", "conventional"),
+    ),
+    Item("Figure 7", "a target that closes, as if at rest", of=_targets, make=partial(_figure, "P2", "conventional")),
+    Item("Figure 14", "a target that moves along track", of=_targets, make=partial(_figure, "P1", "proposed")),
+    Item("Figure 15", "a target that closes", of=_targets, make=partial(_figure, "P2", "proposed")),
     Item("Figure 16", "four targets in one scene", of=_scene, make=_figure_16),
     Item(
         "Table 4",

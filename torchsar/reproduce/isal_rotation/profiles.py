@@ -12,8 +12,9 @@ Common parts of the figures of several targets with non-uniform rotation.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -219,23 +220,19 @@ def _points(small: bool) -> dict[str, _Profile]:
     return _compensated(simulate_turntable(radar, world, 20000, 8, Draws(1))[0].signal, radar)
 
 
-def _shown(names: Sequence[str], reach_m: Sequence[float]) -> Callable[[dict[str, _Profile], Path], list[Check]]:
+def _shown(names: Sequence[str], reach_m: Sequence[float], profiles: dict[str, _Profile], path: Path) -> list[Check]:
     """Make figure 2 or 3, in which the peaks of the outer and of the middle point rise with every
     compensation.
     """
-
-    def make(profiles: dict[str, _Profile], path: Path) -> list[Check]:
-        _draw_profiles(profiles, names, reach_m, path)
-        checks = []
-        for x in (PLACES_M[-1], PLACES_M[1]):
-            peaks = [20 * math.log10(profiles[name].near(x, 5.0).amplitude.max()) for name in names]
-            rising = peaks == sorted(peaks) and abs(peaks[-1]) < 0.1
-            claim = "focused best by the last of the compensations"
-            words = "; ".join(f"{NAMES[name]}: peak {peak:.1f} dB" for name, peak in zip(names, peaks, strict=True))
-            checks.append(statement(f"point at {x:g} m", claim, rising, words))
-        return checks
-
-    return make
+    _draw_profiles(profiles, names, reach_m, path)
+    checks = []
+    for x in (PLACES_M[-1], PLACES_M[1]):
+        peaks = [20 * math.log10(profiles[name].near(x, 5.0).amplitude.max()) for name in names]
+        rising = peaks == sorted(peaks) and abs(peaks[-1]) < 0.1
+        claim = "focused best by the last of the compensations"
+        words = "; ".join(f"{NAMES[name]}: peak {peak:.1f} dB" for name, peak in zip(names, peaks, strict=True))
+        checks.append(statement(f"point at {x:g} m", claim, rising, words))
+    return checks
 
 
 def _deviations(small: bool) -> tuple[Tensor, dict[str, Tensor]]:
@@ -277,12 +274,12 @@ ITEMS = (
         "Figure 2",
         "profiles without, with one- and with two-dimensional compensation",
         of=_points,
-        make=_shown(("none", "azimuth", "full"), (0.025, 0.025, 0.025)),
+        make=partial(_shown, ("none", "azimuth", "full"), (0.025, 0.025, 0.025)),
     ),
     Item(
         "Figure 3",
         "profiles by the order of the compensation",
         of=_points,
-        make=_shown(("none", "order 2", "full"), (1.0, 0.025, 1.0)),
+        make=partial(_shown, ("none", "order 2", "full"), (1.0, 0.025, 1.0)),
     ),
 )

@@ -12,8 +12,8 @@ first scene.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -281,27 +281,23 @@ def _compensated(seen: _Seen, factor: float | None) -> Signal:
     return Signal(image.data, (Axis("Doppler", doppler.n, 1e-3 * doppler.start, 1e-3 * doppler.step, "kHz"), range_))
 
 
-def _picture(factor: float) -> Callable[[_Seen, Path], list[Check]]:
+def _picture(factor: float, seen: _Seen, path: Path) -> list[Check]:
     """Make figure 10, 11 or 12: the middle of the image, a part of it, and the
     recommended image.
     """
-
-    def make(seen: _Seen, path: Path) -> list[Check]:
-        shown, lines = {}, {}
-        for title, one in ((BEGINNINGS[factor], factor), ("recommended", None)):
-            image = _compensated(seen, one)
-            # half of the drawn Doppler interval: a quarter of the band
-            half = -0.25 * image.axes[0].start
-            shown[title] = plot.within(image, {"Doppler": (-half, half)})
-            shown[f"{title}, part"] = plot.within(image, {"Doppler": (PART[0] * half, PART[1] * half)})
-            range_m = image.axis("range")
-            middle_m, half_m = range_m.start + range_m.step * (range_m.n - 1) / 2, range_m.step * range_m.n / 2
-            middle, height = half * sum(PART) / 2, half * (PART[1] - PART[0]) / 2
-            lines[title] = {"part": plot.boxes([(middle_m, middle)], half_m, height)}
-        plot.save(plot.images(shown, 40, percentile=100, lines=lines), path)
-        return _outcome(seen, factor)
-
-    return make
+    shown, lines = {}, {}
+    for title, one in ((BEGINNINGS[factor], factor), ("recommended", None)):
+        image = _compensated(seen, one)
+        # half of the drawn Doppler interval: a quarter of the band
+        half = -0.25 * image.axes[0].start
+        shown[title] = plot.within(image, {"Doppler": (-half, half)})
+        shown[f"{title}, part"] = plot.within(image, {"Doppler": (PART[0] * half, PART[1] * half)})
+        range_m = image.axis("range")
+        middle_m, half_m = range_m.start + range_m.step * (range_m.n - 1) / 2, range_m.step * range_m.n / 2
+        middle, height = half * sum(PART) / 2, half * (PART[1] - PART[0]) / 2
+        lines[title] = {"part": plot.boxes([(middle_m, middle)], half_m, height)}
+    plot.save(plot.images(shown, 40, percentile=100, lines=lines), path)
+    return _outcome(seen, factor)
 
 
 def _outcome(seen: _Seen, factor: float | None) -> list[Check]:
@@ -356,7 +352,7 @@ ITEMS = (
     Item("Figure 8", "image with two-dimensional compensation of third order", _satellite, _figure_8),
     Item("Figure 9", "the same, scaled to metres", _satellite, _figure_9),
     *(
-        Item(f"Figure {label}", f"image by Newton's method {BEGINNINGS[factor]}", _starts, _picture(factor))
+        Item(f"Figure {label}", f"image by Newton's method {BEGINNINGS[factor]}", _starts, partial(_picture, factor))
         for label, factor in zip((10, 11, 12), FACTORS, strict=True)
     ),
     Item("Table 1", "parameters of the simulation", _satellite, _table_1),

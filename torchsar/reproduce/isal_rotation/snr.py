@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -273,15 +274,11 @@ def _full_target(small: bool) -> _Tips:
     return tips
 
 
-def _picture(snr_db: float) -> Callable[[_Tips, Path], list[Check]]:
+def _picture(snr_db: float, tips: _Tips, path: Path) -> list[Check]:
     """Make one of the figures 14 to 17."""
-
-    def make(tips: _Tips, path: Path) -> list[Check]:
-        plot.save(plot.image(tips.images[snr_db], 40, f"SNR {snr_db:g} dB", percentile=100), path)
-        before, after = zip(*tips.entropies[snr_db], strict=True)
-        return [falling("entropy (nats)", {"without compensation": before, "with compensation": after})]
-
-    return make
+    plot.save(plot.image(tips.images[snr_db], 40, f"SNR {snr_db:g} dB", percentile=100), path)
+    before, after = zip(*tips.entropies[snr_db], strict=True)
+    return [falling("entropy (nats)", {"without compensation": before, "with compensation": after})]
 
 
 def _table_4(tips: _Tips, path: Path) -> Made:
@@ -311,7 +308,7 @@ STOPPED = (
 ITEMS = (
     Item("Figure 13", "estimates of the rotation over SNR", _small_target, _figure_13, STOPPED),
     *(
-        Item(f"Figure {label}", f"image at {snr:g} dB", _full_target, _picture(snr))
+        Item(f"Figure {label}", f"image at {snr:g} dB", _full_target, partial(_picture, snr))
         for label, snr in zip(range(14, 18), SNR_DB, strict=True)
     ),
     Item("Table 3", "estimates of the rotation over SNR", _small_target, _table_3, STOPPED),
