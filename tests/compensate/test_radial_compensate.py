@@ -20,7 +20,7 @@ from torchsar.core import Axis, Estimate, Outcome
 from torchsar.focus import compress_sweeps
 from torchsar.radar import sweep_middles
 from torchsar.scene import Polynomial, Scatterers
-from torchsar.scene.vibration import displacement_m
+from torchsar.scene.motion import displacement_m
 from torchsar.study.bench.direct.triangles import table1
 
 RADAR = table1()

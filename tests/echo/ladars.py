@@ -10,7 +10,7 @@ from torch import Tensor
 from torchsar.radar import TriangularLadar
 from torchsar.scene import Points, Polynomial, RetroAndBrokenLine, Scatterers, Sinusoid
 from torchsar.scene.ladar import SweepError
-from torchsar.scene.vibration import displacement_m
+from torchsar.scene.motion import displacement_m
 from torchsar.study.bench.direct.triangles import ground
 
 DOUBLE = torch.complex128

@@ -34,7 +34,7 @@ from torchsar.scene import (
     Speckle,
 )
 from torchsar.scene.ladar_range import Extremes
-from torchsar.scene.vibration import displacement_m
+from torchsar.scene.motion import displacement_m
 from torchsar.study.bench.direct.triangles import table1
 
 FAST = (Polynomial([5.0, 100.0]),)

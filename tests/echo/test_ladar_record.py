@@ -38,7 +38,7 @@ from torchsar.scene import (
     Scatterers,
     Sinusoid,
 )
-from torchsar.scene.vibration import displacement_m
+from torchsar.scene.motion import displacement_m
 from torchsar.study.bench.direct.triangles import table1
 
 COMPLEX4 = table4(detection="complex")

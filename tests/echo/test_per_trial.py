@@ -107,7 +107,7 @@ from torchsar.scene import (
     TurntableWorld,
     VibrationSpectrum,
 )
-from torchsar.scene.fluctuation import Tones
+from torchsar.scene.motion import Tones
 from torchsar.scene.movers import Bend, Movers
 from torchsar.study.names import registry as factories
 

@@ -28,7 +28,7 @@ from torchsar.scene import (
     TurntableWorld,
     UniformStartPhase,
 )
-from torchsar.scene.vibration import displacement_m, start_phase_rad
+from torchsar.scene.motion import displacement_m, start_phase_rad
 
 DOUBLE = torch.complex128
 SMALL = RandomPoints(9, 0.2, 0.05)

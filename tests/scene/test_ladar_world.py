@@ -30,8 +30,8 @@ from torchsar.scene import (
     Sinusoid,
     VibrationSpectrum,
 )
-from torchsar.scene.fluctuation import drawn_motion
 from torchsar.scene.ladar_range import RangeHistory
+from torchsar.scene.motion import drawn_motion
 from torchsar.study.names.files import measured_track
 
 

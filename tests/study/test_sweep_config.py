@@ -25,8 +25,8 @@ from torchsar.study.montecarlo.loop import Plan, run_plan
 from torchsar.study.montecarlo.report import SweepPictures
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.settings.sections import Loaded
-from torchsar.study.systems.stripmap import error_name
 from torchsar.study.table import load
+from torchsar.study.trials.batch import error_name
 from torchsar.study.trials.bench import Bench
 
 SWEEP = {"world.noise.snr_db": [0.0, 20.0], "world.doppler_hz": [-20.0, 30.0], "trials": 6}

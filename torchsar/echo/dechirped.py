@@ -12,8 +12,8 @@ from torchsar.core import Axis, per_trial, unit_phasor
 from torchsar.echo.sums import LineSum, blocks
 from torchsar.radar import InverseRadar
 from torchsar.scene import Motion, PolynomialRotation, Scatterers
+from torchsar.scene.motion import displacement_m
 from torchsar.scene.turntable import Rotation, pulse_length_s, rotation_angle
-from torchsar.scene.vibration import displacement_m
 
 # phase in radians that the model of a dechirped pulse may neglect, by choice
 _DROPPED_RAD = 1e-6

@@ -15,9 +15,8 @@ from torchsar.echo.recorded import Impairment, recorded, trials_of
 from torchsar.echo.sweep_error import calibration_channel
 from torchsar.radar import TriangularLadar
 from torchsar.scene import LadarWorld, Motion, Scatterers
-from torchsar.scene.fluctuation import Tones, drawn_motion
+from torchsar.scene.motion import Tones, displacement_m, drawn_motion
 from torchsar.scene.trials import refuse_other_trials
-from torchsar.scene.vibration import displacement_m
 
 # Number of interpolation nodes between trigger times. Through 16 Chebyshev nodes, a sinusoid with
 # one cycle over their span is exact to 1e-14 of its amplitude.

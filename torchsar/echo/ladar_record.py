@@ -30,7 +30,7 @@ from torchsar.radar import TriangularLadar, sweep_middles
 from torchsar.scene import EverySample, LadarWorld, LinearInSweep, Motion, QuadraticInSweep, Scatterers
 from torchsar.scene.ladar import SweepError
 from torchsar.scene.ladar_range import Effect, RangeHistory
-from torchsar.scene.vibration import displacement_m
+from torchsar.scene.motion import displacement_m
 
 
 def ladar_record(

@@ -16,9 +16,9 @@ from torchsar.echo.recorded import Impairment, noise, recorded, trials_of
 from torchsar.echo.sums import blocks
 from torchsar.radar import InverseRadar
 from torchsar.scene import Dechirped, PolynomialRotation, Scatterers, TurntableWorld
+from torchsar.scene.motion import displacement_m, start_phase_rad
 from torchsar.scene.trials import refuse_other_trials
 from torchsar.scene.turntable import Rotation, rotation_angle
-from torchsar.scene.vibration import displacement_m, start_phase_rad
 
 
 def turntable_echo(

@@ -32,15 +32,6 @@ functions for the response.
 """
 
 from torchsar.core.kinds import check_kinds
-from torchsar.repair.channels import CorrectImbalance, EstimateImbalance, correct_imbalance, estimate_imbalance
-from torchsar.repair.constant import (
-    BalanceQuadrature,
-    RemoveConstant,
-    RemoveTones,
-    balance_quadrature,
-    remove_constant,
-    remove_tones,
-)
 from torchsar.repair.fill import (
     BandLimitedFill,
     LinearFill,
@@ -69,6 +60,18 @@ from torchsar.repair.jitter import (
 from torchsar.repair.jitter_blind import BlindJitter, PilotJitter, estimate_jitter_blind, estimate_jitter_pilot
 from torchsar.repair.lines import LineIntegrity, line_integrity
 from torchsar.repair.placing import regular_lines
+from torchsar.repair.receiver import (
+    BalanceQuadrature,
+    CorrectImbalance,
+    EstimateImbalance,
+    RemoveConstant,
+    RemoveTones,
+    balance_quadrature,
+    correct_imbalance,
+    estimate_imbalance,
+    remove_constant,
+    remove_tones,
+)
 from torchsar.repair.response import CorrectResponse, correct_response
 from torchsar.repair.response_phase import (
     EstimateFlatResponse,

@@ -60,9 +60,19 @@ from torchsar.scene.flight import (
     StraightPath,
     Sway,
 )
-from torchsar.scene.fluctuation import LogAmplitude, MeasuredTrack, PathFluctuation, VibrationSpectrum
 from torchsar.scene.ladar import CalibrationFibre, LadarWorld, LetterE, RetroAndBrokenLine
 from torchsar.scene.ladar_range import EverySample, LinearInSweep, OnePerPeriod, OnePerSweep, QuadraticInSweep
+from torchsar.scene.motion import (
+    LogAmplitude,
+    MeasuredTrack,
+    Motion,
+    PathFluctuation,
+    Polynomial,
+    Sinusoid,
+    StartPhase,
+    UniformStartPhase,
+    VibrationSpectrum,
+)
 from torchsar.scene.movers import Fleet, GroundMovers, MovingPoints, Ship
 from torchsar.scene.path import MotionInSweep, PathWorld, PlaneGround, SideBeam
 from torchsar.scene.satellite import Aircraft, Satellite, SpreadRows
@@ -70,7 +80,6 @@ from torchsar.scene.sea import ImageReflectivity, KSea
 from torchsar.scene.strip import AlwaysLit, Antenna, Dwell, Hyperbola, Parabola, StripmapWorld
 from torchsar.scene.targets import PointCloud, Points, RandomPoints, Scatterers, Scene, Speckle, Together
 from torchsar.scene.turntable import Dechirped, PhaseOnly, PolynomialRotation, TurntableWorld
-from torchsar.scene.vibration import Motion, Polynomial, Sinusoid, StartPhase, UniformStartPhase
 
 __all__ = [
     "Aircraft",

@@ -20,9 +20,8 @@ from torch import Tensor
 from torchsar.core import Draws, Spline, per_trial
 from torchsar.radar.navigation import resample_path
 from torchsar.radar.track import Track
-from torchsar.scene.fluctuation import MeasuredTrack, RandomMotion, drawn_motion
+from torchsar.scene.motion import MeasuredTrack, Motion, RandomMotion, displacement_m, drawn_motion
 from torchsar.scene.trials import finite_numbers, refuse_other_trials, refuse_unless
-from torchsar.scene.vibration import Motion, displacement_m
 
 # largest latency and largest interval of navigation records in seconds, by choice
 _LONGEST_S = 0.5

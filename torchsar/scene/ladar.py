@@ -14,11 +14,10 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchsar.core import Draws
-from torchsar.scene.fluctuation import LogAmplitude, RandomMotion
 from torchsar.scene.ladar_range import Fidelity, LinearInSweep
+from torchsar.scene.motion import LogAmplitude, Motion, RandomMotion
 from torchsar.scene.targets import Scatterers, Scene, unit_phases
 from torchsar.scene.trials import finite, finite_numbers, refuse_unless, with_dims
-from torchsar.scene.vibration import Motion
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from torchsar.radar import TriangularLadar
 from torchsar.radar.ladar import leading
+from torchsar.scene.motion import Motion, displacement_m
 from torchsar.scene.targets import Points, Scatterers
-from torchsar.scene.vibration import Motion, displacement_m
 
 Effect = Literal["residual_video", "hyperbola", "flight"]
 

@@ -13,7 +13,6 @@ import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -167,6 +166,9 @@ class SpreadRows(Scene):
         return Scatterers(*(v.flatten(-2) for v in torch.broadcast_tensors(x, cell[:, None] * step, amplitude)))
 
 
+# Each part has `corners`, their positions (corner, 3), equal in all trials, and `points`, positions
+# (..., n, 3) from uniform random numbers u (..., n, 3), both in the coordinates of the body.
+#
 # The proportions of the body are chosen here; only the position of the panel tip at 6.43 m is
 # published. The three axes before the tilt are: along the panels, along the line of sight away from
 # the radar, and perpendicular to both. The whole model is scaled to the given extents.
@@ -179,18 +181,6 @@ _DISH = (0.2, -1.5, -3.1, 1.2, 0.8)
 _BOOM = ((-0.3, 1.3, 0.3), (-0.5, 3.5, 0.3), (0.45, 0.0, 0.0))
 # fraction of the scatterers in each part, by choice
 _SHARES = {"bus": 0.26, "panel_left": 0.29, "panel_right": 0.29, "dish": 0.08, "boom": 0.08}
-
-
-class _Part(Protocol):
-    """A part of the satellite; its points are in body coordinates."""
-
-    def corners(self) -> Tensor:
-        """Positions of the corners, equal in all trials, (corner, 3)."""
-        ...
-
-    def points(self, u: Tensor) -> Tensor:
-        """Positions of points from uniform random numbers u (..., n, 3), (..., n, 3)."""
-        ...
 
 
 def _table(rows: object) -> Tensor:
@@ -284,7 +274,7 @@ class _Boom:
 
 
 # -1 and 1 are the signs of the cross range of the two panels
-_PARTS: Mapping[str, _Part] = {
+_PARTS: Mapping[str, _Bus | _Panel | _Dish | _Boom] = {
     "bus": _Bus(),
     "panel_left": _Panel(-1.0),
     "panel_right": _Panel(1.0),
@@ -397,7 +387,7 @@ class Satellite(Scene):
         return Scatterers(positions[..., 0], positions[..., 1], torch.polar(*torch.broadcast_tensors(level, phase)))
 
 
-def _part_points(part: _Part, u: Tensor) -> Tensor:
+def _part_points(part: _Bus | _Panel | _Dish | _Boom, u: Tensor) -> Tensor:
     """Corners of a part, followed by points for the remaining random numbers, (..., n, 3)."""
     corners = part.corners()
     return torch.cat([corners.expand(*u.shape[:-2], -1, -1), part.points(u[..., len(corners) :, :])], -2)

@@ -18,9 +18,9 @@ from torch import Tensor
 from torchsar.core import per_trial
 from torchsar.radar import InverseRadar
 from torchsar.radar.warp import least_rate, warp, warp_rate
+from torchsar.scene.motion import Motion, PulsePhase, displacement_m
 from torchsar.scene.targets import Scene
 from torchsar.scene.trials import finite_numbers, refuse_unless_finite
-from torchsar.scene.vibration import Motion, PulsePhase, displacement_m
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ from torchsar.multichannel.scene_image import MoversImage
 from torchsar.multichannel.velocity.aperture import ELEMENT_BEAM, Expected
 from torchsar.radar import LIGHT_M_S, BistaticRadar, FarField, InverseRadar, Spotlight, StripmapRadar
 from torchsar.scene import Dechirped, KSea, Polynomial, Sinusoid
-from torchsar.scene.fluctuation import RandomMotion
+from torchsar.scene.motion import RandomMotion
 from torchsar.study.names.files import image_scene, image_sea, measured_track, point_cloud, recorded_path
 from torchsar.study.settings.errors import loading
 from torchsar.study.settings.signature import Catalogue, Section, snake

@@ -25,8 +25,8 @@ from torchsar.metrics.bounds import pulse_phase_bound_of_scene_rad, pulse_phase_
 from torchsar.metrics.image import rolled_to
 from torchsar.radar import InverseRadar, geometry_of
 from torchsar.scene import Dechirped, Motion, PhaseOnly, Points, Scene, Sinusoid, Together, TurntableWorld
+from torchsar.scene.motion import PulsePhase, displacement_m
 from torchsar.scene.turntable import Fidelity
-from torchsar.scene.vibration import PulsePhase, displacement_m
 from torchsar.study.names.registry import FIDELITIES, MOTIONS, SCENES, START_PHASES, TARGET_IMPAIRMENTS, with_wavelength
 from torchsar.study.output.report import Drawn, first_named
 from torchsar.study.settings.errors import ConfigError

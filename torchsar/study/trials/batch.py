@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -137,6 +138,19 @@ class Found:
     value: Tensor
     std: Tensor | None
     outcome: Tensor | None
+
+
+def error_name(name: str, what: str = "error") -> str:
+    """Return the name of the error of a value: 'doppler_hz' gives 'doppler_error_hz'.
+
+    Args:
+        name: Name of the value, with its unit.
+        what: Word for the error, such as "std".
+
+    Returns:
+        Name with the word before the unit.
+    """
+    return re.sub(r"(_(hz|m_s|m|s|rad|deg|db))?$", rf"_{what}\1", name, count=1)
 
 
 def joined_metrics(parts: Sequence[Metrics]) -> dict[str, Tensor]:

@@ -25,12 +25,11 @@ from torchsar.study.systems.geo.judge import (
     UNKNOWNS,
     FocusedPoint,
     FoundMotion,
-    error_name,
     ideal_responses,
     point_responses,
 )
 from torchsar.study.systems.geo.world import TRUTHS, Points, bistatic_radar, compression_gain_db
-from torchsar.study.trials.batch import IMAGE, OK, Batch, Found, Judged, Processed, Result, Trials
+from torchsar.study.trials.batch import IMAGE, OK, Batch, Found, Judged, Processed, Result, Trials, error_name
 from torchsar.study.trials.bench import TRUTH, Bench
 from torchsar.study.trials.system import Column, System
 
@@ -163,7 +162,7 @@ class Geo(System):
         if focused is not None and trace.signal.names in self.images:
             clean = bench.config.processor[name].input == "clean" or trials.own.snr_db is None
             alone = trace if clean else chain.trace(trials.own.alone, _held(chain, trace))
-            lit = trials.own.integration_s
+            lit = trials.own.world.integration_s
             metrics |= point_responses(alone.signal, focused, truth, lit, bench.judging.orders)
             view = View(alone.signal, alone.outputs[focused.stage], focused)
         verdicts = {}
@@ -197,14 +196,17 @@ class Geo(System):
         metrics = [outcome.metrics for outcome in batch.outcomes.values()]
         kinds: dict[str, tuple[str, ...]] = {}
         if any("u_a_error_m_s" in of for of in metrics):
-            kinds["Cramer-Rao"] = tuple(UNKNOWNS)
+            kinds["Cramer-Rao"] = UNKNOWNS
         if any("u_r_error_m_s" in of and "u_a_error_m_s" not in of for of in metrics):
             kinds["Cramer-Rao, u_a known"] = ("u_r_m_s", "y0_m")
         found: dict[str, dict[str, Tensor]] = {}
         if batch.trials.own.snr_db is None:
             return found
         snr = 10 ** (per_trial(batch.trials.own.snr_db, 0, truth["u_r_m_s"]) / 10)
-        given = {"integration_s": batch.trials.own.integration_s, "covariance": _clutter(batch.trials.own.world, radar)}
+        given = {
+            "integration_s": batch.trials.own.world.integration_s,
+            "covariance": _clutter(batch.trials.own.world, radar),
+        }
         point = [truth[key] for key in TRUTHS]
         for title, unknown in kinds.items():
             bound = bistatic_bounds(radar, world.pulses, snr, *point, unknown=unknown, **given)
@@ -226,7 +228,9 @@ class Geo(System):
         own, world = result.first.trials.own, result.bench.world()
         if focused is None:
             return {}
-        lit = None if own.integration_s is None else float(torch.as_tensor(own.integration_s).reshape(-1)[0])
+        lit = (
+            None if own.world.integration_s is None else float(torch.as_tensor(own.world.integration_s).reshape(-1)[0])
+        )
         radar, known = result.bench.radar, (lit, focused.processed_hz, world.samples is not None)
         speeds = {t: [float(truth[f"{t}.{key}"][0]) for key in ("u_r_m_s", "u_a_m_s")] for t in world.targets}
         return {target: ideal_responses(radar, u_r, u_a, *known) for target, (u_r, u_a) in speeds.items()}

@@ -293,7 +293,7 @@ def _rebuilt(bench: Bench) -> Measured:
     trials = _alone(bench)
 
     def loss(one: Alternative, made: tuple[Signal, FocusedPoint]) -> Mapping[str, float]:
-        found = point_responses(*made, trials.truth, trials.own.integration_s, bench.judging.orders)
+        found = point_responses(*made, trials.truth, trials.own.world.integration_s, bench.judging.orders)
         return {"mfta_db": float(found["mfta_db"].max())}
 
     return Measured(lambda one: _image(bench, trials, rebuild=one.keys["rebuild"]), loss)

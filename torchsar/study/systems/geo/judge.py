@@ -20,27 +20,13 @@ from torchsar.multichannel.azimuth import FocusAzimuth
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.reconstruct import Reconstruct, condition_number, noise_gain_db
 from torchsar.radar import BistaticRadar
+from torchsar.study.trials.batch import error_name
 
 # symbols of the unknowns, by their names in true values and estimates
-UNKNOWNS = {"u_r_m_s": "u_r", "u_a_m_s": "u_a", "y0_m": "y0"}
+UNKNOWNS = ("u_r_m_s", "u_a_m_s", "y0_m")
 # properties of a sinc: -3 dB width over the spacing of its nulls, and levels of the side lobes up
 # to 20 nulls to either side
 _WIDTH, _PSLR_DB, _ISLR_DB = 0.8859, -13.26, -9.92
-
-
-def error_name(key: str, what: str = "error") -> str:
-    """Return the name under which the error of an unknown is reported.
-
-    For example, u_r_m_s becomes u_r_error_m_s.
-
-    Args:
-        key: Name of the unknown: u_r_m_s, u_a_m_s or y0_m.
-        what: "error", or "std" for a predicted standard deviation.
-
-    Returns:
-        Name of the figure.
-    """
-    return f"{UNKNOWNS[key]}_{what}{key.removeprefix(UNKNOWNS[key])}"
 
 
 @dataclass(frozen=True)

@@ -123,11 +123,6 @@ class Own(NamedTuple):
     snr_db: Tensor | None
     world: Points
 
-    @property
-    def integration_s(self) -> Tensor | float | None:
-        """Time in s for which targets are illuminated; None for an antenna pattern."""
-        return self.world.integration_s
-
 
 @dataclass(frozen=True, kw_only=True)
 class Points(World):

@@ -27,7 +27,7 @@ from torchsar.multichannel.scene_image import MoversImage
 from torchsar.multichannel.stationary import bulk_error_db, swath_limit
 from torchsar.scene import BandLimited, MovingPoints
 from torchsar.study.settings.errors import ConfigError
-from torchsar.study.systems.geo_ocean.judge import FoundTarget, MadeScene, matched, ship_metrics
+from torchsar.study.systems.geo_ocean.judge import FoundTarget, MadeScene, at_rest, matched, ship_metrics
 from torchsar.study.trials.batch import last_stage
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Alternative, Choice, Measured
@@ -113,7 +113,9 @@ def choices(bench: Bench) -> list[Choice]:
     settings with which the recommended method images moving ships.
     """
     radar, world, lit = bench.radar, bench.world(), _integration_s(bench) or _PATTERN_S
-    lost = bulk_error_db(radar, _rebuild(bench).bands, world.samples / 2 * radar.range_step_m, lit)
+    lost = bulk_error_db(
+        radar, at_rest(bench.chains["recommended"]).rebuild.bands, world.samples / 2 * radar.range_step_m, lit
+    )
     forms = [
         Alternative("bulk", {"form": "bulk"}, {"image_error_db": lost}, "change of migration over the swath"),
         Alternative("stolt", {"form": "stolt"}, {}),
@@ -129,17 +131,11 @@ def choices(bench: Bench) -> list[Choice]:
     return found
 
 
-def _rebuild(bench: Bench) -> Any:
-    """Reconstruction of the scene at rest by the recommended method."""
-    last = _last(bench, "recommended")
-    return (last.flow.image if isinstance(last, MoversImage) else last).rebuild
-
-
 def _forms(bench: Bench) -> Measured:
     """Measure the error of images of points at rest at both edges of the swath by each form,
     relative to the exact one.
     """
-    radar, world, rebuild = bench.radar, bench.world(), _rebuild(bench)
+    radar, world, rebuild = bench.radar, bench.world(), at_rest(bench.chains["recommended"]).rebuild
     axes = radar.axes(world.pulses, world.samples)
     edge = 0.9 * world.samples / 2 * radar.range_step_m
     points = MovingPoints([[0.0], [0.0]], [[0.0], [0.0]], [[0.0], [0.0]], [[-edge], [edge]])  # pyright: ignore

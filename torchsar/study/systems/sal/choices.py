@@ -19,8 +19,8 @@ from torchsar.focus import AzimuthMatchedFilter
 from torchsar.focus.ladar_requirements import ladar_limits, ladar_requirements
 from torchsar.focus.requirements import Limit, Requirement
 from torchsar.metrics import error_after_gain_db
-from torchsar.scene.fluctuation import drawn_motion
 from torchsar.scene.ladar_range import Moved
+from torchsar.scene.motion import drawn_motion
 from torchsar.study.names.registry import SWEEP_FIDELITIES
 from torchsar.study.systems.sal.judge import lit_periods
 from torchsar.study.trials.bench import Bench

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -32,7 +31,7 @@ from torchsar.study.systems.stripmap import figures
 from torchsar.study.systems.stripmap.choices import choices, probe_of
 from torchsar.study.systems.stripmap.image import Margin, Used, window
 from torchsar.study.trials import system
-from torchsar.study.trials.batch import IMAGE, Batch, Judged, Processed, Result, Trials
+from torchsar.study.trials.batch import IMAGE, Batch, Judged, Processed, Result, Trials, error_name
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Choice
 from torchsar.study.trials.system import Column, Noise, System, World, named_points
@@ -108,7 +107,6 @@ class Strip(World):
         return named_points(self.scene, {Points: None, RandomPoints: None})
 
 
-_UNIT = re.compile(r"_(hz|m_s|m|s|rad|deg|db)$")
 _FIGURES = ("irw_azimuth_m", "irw_range_m", "pslr_azimuth_db", "pslr_range_db", "islr_azimuth_db", "islr_range_db")
 
 
@@ -149,11 +147,6 @@ def estimation_metrics(trace: Trace, trials: Trials, prf_hz: float) -> dict[str,
     if doppler is not None and "doppler_hz" in truth:
         metrics["doppler_baseband_error_hz"] = wrapped(doppler - truth["doppler_hz"].to(doppler), prf_hz)
     return metrics
-
-
-def error_name(name: str) -> str:
-    """Name of the error of a value: 'doppler_hz' gives 'doppler_error_hz'."""
-    return _UNIT.sub(r"_error_\1", name) if _UNIT.search(name) else f"{name}_error"
 
 
 def positions(chain: Chain, used: Used, bench: Bench, trials: Trials) -> tuple[Tensor, Tensor]:
