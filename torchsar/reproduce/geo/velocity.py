@@ -287,7 +287,7 @@ def _equation_28() -> Check:
     )
 
 
-def _table_3() -> Check:
+def _about_table_3() -> Check:
     worst, relative = max(TABLE_3.values()), max(100 * error / abs(u_r) for u_r, error in TABLE_3.items())
     ours = f"the table has {worst:g} m/s and {relative:.0f} %"
     return misprint("largest errors of Table 3", "below 0.15 m/s and below 3 %", worst > 0.15 and relative > 3, ours)
@@ -341,5 +341,5 @@ ITEMS = (
     given("Erratum 2", "range error between channels", _equation_13()),
     given("Erratum 3", "Doppler bandwidth of the transmitter", _equation_28()),
     given("Erratum 4", "displacement in azimuth", _equation_30()),
-    given("Erratum 5", "text about Table 3", _table_3()),
+    given("Erratum 5", "text about Table 3", _about_table_3()),
 )
