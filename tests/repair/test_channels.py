@@ -85,7 +85,7 @@ def test_outcomes_and_values_without_assessment(monkeypatch):
     )
     error = found["phase_rad"][found.doubtful, 1] - 50 * DEGREE
     assert float(error.square().mean().sqrt()) < 10 * DEGREE  # a fifth of what it corrects
-    monkeypatch.setattr("torchsar.repair.channels.assess_imbalance", None)
+    monkeypatch.setattr("torchsar.repair.receiver.assess_imbalance", None)
     plain = EstimateImbalance(assess=False)(
         Signal(few, (Axis("pulse", 10, 0.0, 1.0, "s"), Axis("range", 16, 0.0, 1.0, "m")))
     )

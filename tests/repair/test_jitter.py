@@ -268,8 +268,7 @@ def test_outcomes_and_values_without_assessment(monkeypatch):
     pilots = torch.cat([sample_unevenly(tone[None], OFFSETS), noise, 0 * noise, tone[None] + 0.5 * noise])
     pilot = estimate_jitter_pilot(pilots, 8)
     assert pilot.outcome.tolist() == [Outcome.OK, Outcome.NOISE, Outcome.EMPTY, Outcome.INEXACT]
-    for module in ("jitter_blind", "jitter_pilot"):
-        monkeypatch.setattr(f"torchsar.repair.{module}.assess_offsets", None)
+    monkeypatch.setattr("torchsar.repair.jitter_blind.assess_offsets", None)
     signal = small_recording(32, 512, trials=4)[0].signal
     for found, plain in (
         (blind, BlindJitter(8, assess=False)(signal.with_data(y))),

@@ -12,7 +12,7 @@ from torchsar.core import Recording, refuse_non_finite, unit_phasor
 from torchsar.io.fields import joined, parted, refuse_carrier, refuse_implausible
 from torchsar.io.history import history_radar
 from torchsar.radar import AntennaPath, range_profiles
-from torchsar.repair.analytic import delayed
+from torchsar.repair.trigger import delayed
 
 
 def fmcw_recording(
