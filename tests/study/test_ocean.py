@@ -12,7 +12,7 @@ from tests.study.scenes import FLOW, GEO_OCEAN, SHIP, bench_of, world
 from torchsar.core import Axis, Draws, Outcome, Signal
 from torchsar.multichannel.motion import PointMotion
 from torchsar.study.commands.requires import refuse_beyond_limits
-from torchsar.study.systems.geo_ocean import figures
+from torchsar.study.systems.geo_ocean import judge as figures
 from torchsar.study.systems.geo_ocean.judge import ImagePosition
 from torchsar.study.table import load
 from torchsar.study.trials.bench import Bench

@@ -82,9 +82,10 @@ from torchsar.multichannel.velocity.stages import (
     GradientVelocity,
     Interferometry,
     LikelihoodVelocity,
+    MigratingLines,
     MovingPointVelocity,
+    WalkAmbiguity,
 )
-from torchsar.multichannel.velocity.walk import MigratingLines, WalkAmbiguity
 
 __all__ = [
     "AlongTrackAutofocus",

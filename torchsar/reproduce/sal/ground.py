@@ -43,8 +43,7 @@ from torchsar.scene import (
     RetroAndBrokenLine,
     Sinusoid,
 )
-from torchsar.study.systems.sal.figures import in_milliseconds
-from torchsar.study.systems.sal.judge import Course, course_of, finer_in_range
+from torchsar.study.systems.sal.judge import Course, course_of, finer_in_range, in_milliseconds
 
 # values of Table 4; the sampling is that of the text, and the speed follows from azimuth cells of
 # 0.1 mm

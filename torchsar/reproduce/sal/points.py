@@ -55,8 +55,7 @@ from torchsar.metrics.cuts import impulse_cuts
 from torchsar.radar import LIGHT_M_S, TriangularLadar
 from torchsar.reproduce.item import Check, Item, falling, number, parameters, seeds_of, statement
 from torchsar.scene import LadarWorld, LetterE, Points, Polynomial, QuadraticInSweep, Sinusoid
-from torchsar.study.systems.sal.figures import in_milliseconds
-from torchsar.study.systems.sal.judge import Course, course_of, finer_in_range
+from torchsar.study.systems.sal.judge import Course, course_of, finer_in_range, in_milliseconds
 
 # values of Table 1; the sampling is chosen
 RADAR = TriangularLadar(

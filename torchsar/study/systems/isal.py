@@ -16,12 +16,20 @@ from torchsar.compensate import autofocus
 from torchsar.core import Chain, Draws, Recording, Signal, Trace
 from torchsar.echo import Impairment, Simulate
 from torchsar.echo.turntable import rotation_angle
-from torchsar.focus import AzimuthTransform, CompressDechirped
-from torchsar.focus.inverse_requirements import inverse_requirements
+from torchsar.focus import AzimuthTransform, CompressDechirped, inverse_requirements
 from torchsar.focus.requirements import Requirement
 from torchsar.io import read_inverse
-from torchsar.metrics import contrast, entropy, error_db, phase_rmse, residual_phase, strehl
-from torchsar.metrics.bounds import pulse_phase_bound_of_scene_rad, pulse_phase_bound_rad, turntable_responses
+from torchsar.metrics import (
+    contrast,
+    entropy,
+    error_db,
+    phase_rmse,
+    pulse_phase_bound_of_scene_rad,
+    pulse_phase_bound_rad,
+    residual_phase,
+    strehl,
+)
+from torchsar.metrics.bounds import turntable_responses
 from torchsar.metrics.image import rolled_to
 from torchsar.radar import InverseRadar, geometry_of
 from torchsar.scene import Dechirped, Motion, PhaseOnly, Points, Scene, Sinusoid, Together, TurntableWorld

@@ -20,13 +20,16 @@ from torchsar.study.names.registry import MULTICHANNEL_IMPAIRMENTS
 from torchsar.study.output.report import Drawn, comparisons
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.settings.sections import Loaded
-from torchsar.study.systems.geo import choices, figures
+from torchsar.study.systems.geo import choices
 from torchsar.study.systems.geo.judge import (
+    DRAW_CASE,
     UNKNOWNS,
     FocusedPoint,
     FoundMotion,
+    by_target,
     ideal_responses,
     point_responses,
+    shots,
 )
 from torchsar.study.systems.geo.world import TRUTHS, Points, bistatic_radar, compression_gain_db
 from torchsar.study.trials.batch import IMAGE, OK, Batch, Found, Judged, Processed, Result, Trials, error_name
@@ -70,7 +73,7 @@ class Geo(System):
     Judging = Judging
     impairments = MULTICHANNEL_IMPAIRMENTS
     images = (("azimuth",), IMAGE)
-    draw_case = figures.DRAW_CASE
+    draw_case = DRAW_CASE
     truths = TRUTHS
     peak = 12.0
     tolerance = {"image_error_db": -20.0, "echo_error_db": -20.0, "mfta_db": -50.0, "width_change_percent": 1.0}
@@ -236,12 +239,11 @@ class Geo(System):
         return {target: ideal_responses(radar, u_r, u_a, *known) for target, (u_r, u_a) in speeds.items()}
 
     def pictures(self, results: Mapping[str, Result]) -> Iterator[Callable[[], Drawn]]:
-        yield partial(comparisons, figures.by_target(results), self.target_columns)
+        yield partial(comparisons, by_target(results), self.target_columns)
         yield from self.case_pictures(results)
 
     def pictured(self, result: Result) -> dict[str, Signal]:
-        shots = figures.shots(result)
-        return {f"{name}/{target}": shot.image for name, of in shots.items() for target, shot in of.items()}
+        return {f"{name}/{target}": shot.image for name, of in shots(result).items() for target, shot in of.items()}
 
     def notes(self, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         levels = metrics["definitions"]

@@ -14,8 +14,7 @@ from torch import Tensor
 from torchsar.core import Alternate, Chain, Draws, Signal
 from torchsar.echo import bistatic_echo
 from torchsar.focus.requirements import Limit, Requirement
-from torchsar.metrics import error_db
-from torchsar.metrics.replicas import azimuth_response
+from torchsar.metrics import azimuth_response, error_db
 from torchsar.multichannel import (
     AlongTrackAutofocus,
     CorrectMigration,
@@ -26,6 +25,7 @@ from torchsar.multichannel import (
     Keystone,
     LeastSquares,
     LikelihoodVelocity,
+    MigratingLines,
     MinimumMeanSquare,
     MovingPointVelocity,
     MultichannelUse,
@@ -40,7 +40,6 @@ from torchsar.multichannel import (
 )
 from torchsar.multichannel.azimuth import known_motion_chain
 from torchsar.multichannel.requirements import Estimator
-from torchsar.multichannel.velocity.walk import MigratingLines
 from torchsar.scene import BandLimited, ExactRange, MovingPoints, TaylorRange
 from torchsar.scene.lit_points import LitPoints
 from torchsar.study.systems.geo.judge import FocusedPoint, PeakCuts, point_responses, worst_image_error_db

@@ -15,9 +15,17 @@ from torch import Tensor
 
 from torchsar.core import Draws, Outcome, Signal, Trace
 from torchsar.echo import Impairment, apply_impairments, bistatic_echo, simulate_bistatic
-from torchsar.multichannel import Extraction, PointMotion, RemoveTransmitRange, StationaryImage
-from torchsar.multichannel.reconstruct import LeastSquares, Rebuild, condition_number, noise_gain_db
-from torchsar.multichannel.scene_image import MoversImage
+from torchsar.multichannel import (
+    Extraction,
+    LeastSquares,
+    MoversImage,
+    PointMotion,
+    RemoveTransmitRange,
+    StationaryImage,
+    condition_number,
+    noise_gain_db,
+)
+from torchsar.multichannel.reconstruct import Rebuild
 from torchsar.radar import BistaticRadar
 from torchsar.scene import BandLimited, BistaticWorld, Fleet, KSea
 from torchsar.scene import Ship as ShipOfPoints
@@ -27,10 +35,11 @@ from torchsar.scene.sea import Sea
 from torchsar.study.names.registry import GATES, MULTICHANNEL_IMPAIRMENTS, SEAS
 from torchsar.study.output.report import Drawn, comparisons
 from torchsar.study.settings.errors import ConfigError
-from torchsar.study.systems.geo.figures import by_target
+from torchsar.study.systems.geo.judge import by_target
 from torchsar.study.systems.geo.world import TRUTHS, bistatic_radar
-from torchsar.study.systems.geo_ocean import choices, figures
+from torchsar.study.systems.geo_ocean import choices
 from torchsar.study.systems.geo_ocean.judge import (
+    DRAW_CASE,
     FoundTarget,
     MadeScene,
     Ship,
@@ -252,7 +261,7 @@ class GeoOcean(System):
     impairments = MULTICHANNEL_IMPAIRMENTS
     ending = "movers_image or stationary_image"
     truths = TRUTHS
-    draw_case = figures.DRAW_CASE
+    draw_case = DRAW_CASE
     peak = 12.0
     tolerance = {"image_error_db": -20.0, "position_error_m": 10.0, "sea_error_db": -10.0}
     exact = {"stationary_image.form": {"form": "stolt"}}

@@ -16,6 +16,7 @@ from torchsar.focus.requirements import Limit, Requirement
 from torchsar.metrics import error_db
 from torchsar.multichannel import (
     ImageMovers,
+    MoversImage,
     MultichannelUse,
     RemoveTransmitRange,
     SceneImage,
@@ -23,7 +24,6 @@ from torchsar.multichannel import (
     multichannel_limits,
     multichannel_requirements,
 )
-from torchsar.multichannel.scene_image import MoversImage
 from torchsar.multichannel.stationary import bulk_error_db, swath_limit
 from torchsar.scene import BandLimited, MovingPoints
 from torchsar.study.settings.errors import ConfigError

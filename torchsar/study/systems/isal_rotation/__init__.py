@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Trace
-from torchsar.focus.matched_fourier import MatchedFourier
+from torchsar.focus import MatchedFourier
 from torchsar.focus.requirements import Limit
 from torchsar.metrics import contrast, entropy, rotation_bounds
 from torchsar.radar import InverseRadar
@@ -21,8 +21,15 @@ from torchsar.scene import Points, PolynomialRotation, Scatterers, Scene, Togeth
 from torchsar.study.names.registry import TARGET_IMPAIRMENTS, with_wavelength
 from torchsar.study.systems.isal import Target
 from torchsar.study.systems.isal import target as draw_target
-from torchsar.study.systems.isal_rotation import choices, figures
-from torchsar.study.systems.isal_rotation.judge import CrossRangeCut, FoundRotation, cross_range_cut, k_scales, true_k
+from torchsar.study.systems.isal_rotation import choices
+from torchsar.study.systems.isal_rotation.judge import (
+    DRAW_CASE,
+    CrossRangeCut,
+    FoundRotation,
+    cross_range_cut,
+    k_scales,
+    true_k,
+)
 from torchsar.study.trials import system
 from torchsar.study.trials.batch import IMAGE, Batch, Judged, Processed, Trials
 from torchsar.study.trials.bench import Bench
@@ -197,7 +204,7 @@ class IsalRotation(System):
 
     settings = {"reference": "reference", "search_m": "search_m"}
     draw_first = (draw_target,)
-    draw_case = figures.DRAW_CASE
+    draw_case = DRAW_CASE
 
     def simulate(self, bench: Bench, world: Rotating, draws: Draws) -> Trials:
         made = world.trials_of(bench.radar, draws, bench.dtype, bench.device)

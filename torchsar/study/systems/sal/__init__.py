@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
-from torchsar.compensate.radial import SpectrumCorrelation
+from torchsar.compensate import SpectrumCorrelation
 from torchsar.core import Trace
 from torchsar.echo import Impairment, Simulate, simulate_ladar_record
 from torchsar.metrics import (
@@ -50,8 +50,8 @@ from torchsar.study.names.registry import (
     with_wavelength,
 )
 from torchsar.study.settings.errors import ConfigError, did_you_mean
-from torchsar.study.systems.sal import choices, figures
-from torchsar.study.systems.sal.judge import course_of, target_responses
+from torchsar.study.systems.sal import choices
+from torchsar.study.systems.sal.judge import DRAW_CASE, course_of, target, target_responses
 from torchsar.study.trials import system
 from torchsar.study.trials.batch import IMAGE, Batch, Judged, Trials
 from torchsar.study.trials.bench import Bench
@@ -216,8 +216,8 @@ class Sal(System):
     }
 
     settings = {"islr_extent_nulls": "sidelobe_nulls", "reference": "reference", "target": "target"}
-    draw_first = (figures.target,)
-    draw_case = figures.DRAW_CASE
+    draw_first = (target,)
+    draw_case = DRAW_CASE
 
     def samples(self, world: Ground, radar: TriangularLadar) -> int:
         per_period = 2 * radar.sweep_samples

@@ -11,12 +11,11 @@ from typing import Any, get_args
 import torch
 from torch import Tensor
 
-from torchsar.compensate.radial import mirror_product, radial_motion, segmented_interference, spectrum_correlation
+from torchsar.compensate import mirror_product, radial_motion, segmented_interference, spectrum_correlation
 from torchsar.compensate.radial.measured import Intercept
 from torchsar.core import Draws, Estimate
 from torchsar.echo.ladar import range_model_error_db
-from torchsar.focus import AzimuthMatchedFilter
-from torchsar.focus.ladar_requirements import ladar_limits, ladar_requirements
+from torchsar.focus import AzimuthMatchedFilter, ladar_limits, ladar_requirements
 from torchsar.focus.requirements import Limit, Requirement
 from torchsar.metrics import error_after_gain_db
 from torchsar.scene.ladar_range import Moved

@@ -18,8 +18,16 @@ from torchsar.focus import ClosestRange
 from torchsar.focus.requirements import Limit, Requirement, strip_limits
 from torchsar.focus.skew import common_lines
 from torchsar.io import read_stripmap
-from torchsar.metrics import contrast, correlation, entropy, error_db, impulse_response
-from torchsar.metrics.bounds import reference_doppler_std_hz, tone_frequency_bound_hz, velocity_bound_m_s
+from torchsar.metrics import (
+    contrast,
+    correlation,
+    entropy,
+    error_db,
+    impulse_response,
+    reference_doppler_std_hz,
+    tone_frequency_bound_hz,
+    velocity_bound_m_s,
+)
 from torchsar.radar import StripmapRadar
 from torchsar.scene import AlwaysLit, Hyperbola, MovingPoints, Points, RandomPoints, Scene, StripmapWorld, Together
 from torchsar.scene.strip import Beam, Path
@@ -27,9 +35,8 @@ from torchsar.study.names.registry import BEAMS, IMPAIRMENTS, PATHS, SCENES, wit
 from torchsar.study.output.report import Drawn, comparisons
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.settings.sections import Loaded
-from torchsar.study.systems.stripmap import figures
 from torchsar.study.systems.stripmap.choices import choices, probe_of
-from torchsar.study.systems.stripmap.image import Margin, Used, window
+from torchsar.study.systems.stripmap.judge import DRAW_CASE, Margin, Used, window
 from torchsar.study.trials import system
 from torchsar.study.trials.batch import IMAGE, Batch, Judged, Processed, Result, Trials, error_name
 from torchsar.study.trials.bench import Bench
@@ -282,7 +289,7 @@ class Stripmap(System):
     }
 
     settings = {"islr_extent_nulls": "sidelobe_nulls", "reference": "reference"}
-    draw_case = figures.DRAW_CASE
+    draw_case = DRAW_CASE
     plain_names = True
     read = staticmethod(partial(read_stripmap, regular=True))  # pyright: ignore[reportAssignmentType]
 
