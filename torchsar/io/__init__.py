@@ -21,16 +21,14 @@ strip longer than memory             `StripImage`, `write_strip_geotiff`
 from torchsar.core.kinds import check_kinds
 from torchsar.io.arrays import read_images
 from torchsar.io.cphd import read_cphd, write_cphd
+from torchsar.io.export import write_geotiff, write_netcdf, write_strip_geotiff
 from torchsar.io.fmcw import fmcw_recording
 from torchsar.io.formats import read, read_history
-from torchsar.io.geotiff import write_geotiff, write_strip_geotiff
 from torchsar.io.history import read_inverse, read_path
-from torchsar.io.netcdf import write_netcdf
 from torchsar.io.plain import read_array, read_points
-from torchsar.io.recorded import read_stripmap
 from torchsar.io.sicd import read_sicd, write_sicd
 from torchsar.io.sidecar import import_recording
-from torchsar.io.strip import StripImage
+from torchsar.io.strip import StripImage, read_stripmap
 
 __all__ = [
     "StripImage",

@@ -12,8 +12,8 @@ from torchsar.core import Recording, Signal
 from torchsar.io.cphd import read_cphd
 from torchsar.io.fields import archive, refuse_absent
 from torchsar.io.history import read_inverse, read_path
-from torchsar.io.recorded import read_stripmap
 from torchsar.io.sicd import read_sicd
+from torchsar.io.strip import read_stripmap
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from torchsar.io.containers import Container, flat_array, open_container
 from torchsar.io.extras import write_whole
 from torchsar.io.fields import Described, Level, complex_type, joined, naming, parted
 from torchsar.io.history import describe_inverse, describe_path
-from torchsar.io.recorded import describe_stripmap
+from torchsar.io.strip import describe_stripmap
 from torchsar.spelling import did_you_mean
 
 # size in bytes of a block of complex samples, large enough for fast reading
