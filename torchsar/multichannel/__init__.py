@@ -65,7 +65,12 @@ from torchsar.multichannel.requirements import MultichannelUse, multichannel_req
 from torchsar.multichannel.response import ElementPattern, FlatBand, doppler_offsets
 from torchsar.multichannel.scene_image import Detector, ImageMovers, MoversImage, SceneImage
 from torchsar.multichannel.stationary import StationaryImage, stationary_image
-from torchsar.multichannel.synchronise import ClutterSynchronisation, EstimateSynchronisation, RemoveSynchronisation
+from torchsar.multichannel.synchronise import (
+    ClutterSynchronisation,
+    EstimateSynchronisation,
+    RemoveSynchronisation,
+    clutter_synchronisation,
+)
 from torchsar.multichannel.transmit import (
     AzimuthScaling,
     CompressChannels,
@@ -127,6 +132,7 @@ __all__ = [
     "StaticBulk",
     "StationaryImage",
     "WalkAmbiguity",
+    "clutter_synchronisation",
     "condition_number",
     "correct_balance",
     "correct_migration",
