@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from torchsar import Draws, Outcome, Signal
-from torchsar.compensate import DopplerCentroid, MirrorProduct, PhaseIncrement, RadialMotion
+from torchsar.compensate import DopplerCentroid, MirrorProduct, PhaseIncrement, RadialMotion, phase_increment
+from torchsar.compensate.doppler import agreeing_cells
 from torchsar.echo import simulate, simulate_ladar
 from torchsar.scene import Dwell, LadarWorld, Points, Polynomial, RandomPoints, StripmapWorld
 from torchsar.study.bench.ladars import MOTION, PERIODS
@@ -42,6 +43,22 @@ def test_a_ship_that_moves_across_the_track_is_named(stage) -> None:
     assert bool((ship["doppler_baseband_hz"] > 90).all()) and not bool(ship.ok.any())
     assert stage is DopplerCentroid or bool((ship.outcome == Outcome.PARTS_DISAGREE).all())
     assert bool((alone.outcome == Outcome.OK).all())
+
+
+def test_the_median_of_range_cells_resists_a_ship_and_a_hot_cell() -> None:
+    both, alone = strip(0.0, across_hz=110.0), strip(-60.0, across_hz=110.0)
+    mean, median = (DopplerCentroid(RADAR, over=over) for over in ("mean", "median"))
+    assert bool((mean(both)["doppler_hz"] > 50).all())
+    found = median(both)
+    assert bool(((found["doppler_hz"] - 5).abs() < 6).all()) and not bool(found.ok.any())
+    assert bool(median(alone).ok.all())
+    turns = 0.1 * torch.arange(64)[:, None] + torch.rand(32, generator=torch.Generator().manual_seed(1))
+    hot = torch.polar(torch.ones(64, 32), 2 * torch.pi * turns)
+    hot[:, 5] = 100 * torch.polar(torch.ones(64), 2.0 * torch.arange(64))
+    for cells, expected_hz in ((hot, 318.0), (agreeing_cells(hot), 100.0)):
+        assert float(phase_increment(cells, 1000.0)["doppler_baseband_hz"]) == pytest.approx(expected_hz, abs=1.0)
+    with pytest.raises(ValueError, match="over must be 'mean' or 'median' of the range cells, got 'sum'"):
+        DopplerCentroid(RADAR, over="sum")  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize("stage", [MirrorProduct, RadialMotion])

@@ -12,6 +12,7 @@ from torchsar.echo import ChannelImbalance
 from torchsar.io import read_stripmap
 from torchsar.metrics import correlation
 from torchsar.repair import CorrectImbalance, EstimateImbalance, correct_imbalance, estimate_imbalance
+from torchsar.study.bench.repairs import imbalance
 
 DEGREE = math.pi / 180
 
@@ -142,3 +143,20 @@ def test_even_and_odd_lines_of_recorded_data(recorded, name, hz):
     assert float(correlation(trace.signal.data.to(torch.complex128), clean.signal.data.to(torch.complex128))) > 0.99999
     with_doppler = EstimateImbalance()(impaired.signal, doppler_hz=torch.tensor(hz, dtype=torch.float64))
     torch.testing.assert_close(with_doppler["phase_rad"], trace.values["imbalance.phase_rad"])
+
+
+@pytest.mark.parametrize("over_db", [-30.0, -15.0, -5.0, 10.0, 30.0])
+def test_constants_of_converters_are_named(over_db: float) -> None:
+    """A constant that held the energy was taken for equal channels, and ok."""
+    batch = imbalance(10.0)(8, 3)
+    data, turn = batch.data.data, torch.rand(8, 2, 1, generator=torch.Generator().manual_seed(1))
+    level = data.abs().square().mean((-2, -1), keepdim=True).sqrt() * 10 ** (over_db / 20)
+    own = level * torch.polar(torch.ones_like(turn), 2 * math.pi * turn)[:, torch.arange(data.shape[-2]) % 2]
+    found = estimate_imbalance((data + own).to(data.dtype))
+    if over_db > -10:
+        assert bool((found.outcome == Outcome.AT_REST).all())
+    else:
+        assert bool(found.ok.all())
+        for name in ("gain", "phase_rad"):
+            off = (found[name] - batch.truth[name])[..., 1].abs()
+            assert bool((off < 5 * found.std[name][..., 1] + 1e-3).all())

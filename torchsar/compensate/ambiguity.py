@@ -22,13 +22,14 @@ Doppler is positive when closing. Range changes by -lambda f_dc / 2 metres per s
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from torchsar.compensate import doppler_assess
 from torchsar.compensate.aperture import complete_aperture_centroid, reference_spectrum
-from torchsar.compensate.doppler import lag_products, nominal_doppler, swept_band
+from torchsar.compensate.doppler import agreeing_cells, lag_products, nominal_doppler, swept_band
 from torchsar.compensate.group import (
     BeamSpectrum,
     RangeGroup,
@@ -36,6 +37,7 @@ from torchsar.compensate.group import (
     beam_spectrum,
     block_entropy,
     block_weights,
+    compress,
     pick_group,
     student_log_likelihood,
 )
@@ -239,9 +241,14 @@ class DopplerCentroid(Stage):
         reach: Largest ambiguity that is searched, in PRFs.
         blocks: Number of blocks along pulses and along range for the baseband centroid.
         assess: Whether to add standard deviations, the quality and the outcome.
+        over: "mean" uses all range cells by their energy. "median" resists a target that moves on
+            its own, or a hot range cell: compressed cells whose phase increment departs from the
+            median of all are left out, and no cell has more than the median power. The assessment
+            is that of all cells, so that the outcome still names what was left out. Side lobes of a
+            target that is 10 dB or more above the scene are in most cells, and it prevails.
 
     Raises:
-        ValueError: If the range reference is unknown or `reach` is below one.
+        ValueError: If the range reference or `over` is unknown, or `reach` is below one.
 
     Reference:
         Tsvetkov 2017, text after Fig. 5.
@@ -257,8 +264,11 @@ class DopplerCentroid(Stage):
         reach: int = 12,
         blocks: tuple[int, int] = (8, 8),
         assess: bool = True,
+        over: Literal["mean", "median"] = "mean",
     ) -> None:
         super().__init__()
+        if over not in ("mean", "median"):
+            raise ValueError(f"over must be 'mean' or 'median' of the range cells, got {over!r}")
         if reference is not None and reference not in REFERENCES:
             raise ValueError(
                 f"range reference {reference!r} is unknown; choose one of {sorted(REFERENCES)}, or "
@@ -270,7 +280,7 @@ class DopplerCentroid(Stage):
         # v / lambda
         most = math.floor(1.88 * radar.velocity_m_s / (radar.wavelength_m * radar.prf_hz) - 0.5)
         self.radar, self.reference, self.reach = radar, reference, max(0, min(reach, most))
-        self.blocks, self.assess = blocks, assess
+        self.blocks, self.assess, self.over = blocks, assess, over
         nominal = torch.tensor(nominal_doppler(radar)["doppler_hz"], dtype=torch.float64)
         self.neutral = {name: float(value) for name, value in self._values(nominal).items()}
 
@@ -300,19 +310,24 @@ class DopplerCentroid(Stage):
             of the PRF on.
         """
         radar, raw = self.radar, checked_samples(signal.data, "DopplerCentroid", "pulse, range")
-        n, prf = raw.shape[-1], radar.prf_hz
         products, power = lag_products(raw, self.blocks)
-        base = wrapped(prf / (2 * math.pi) * torch.angle(products.sum((-2, -1))), prf)
+        cells, reference, kept = raw, self.reference, products
+        if self.over == "median":
+            # in compressed cells a target is seen in few of them
+            cells, reference = agreeing_cells(compress(raw, radar, reference_spectrum(radar, reference, raw))), None
+            kept = lag_products(cells, self.blocks)[0]
+        n, prf = raw.shape[-1], radar.prf_hz
+        base = wrapped(prf / (2 * math.pi) * torch.angle(kept.sum((-2, -1))), prf)
         turns = torch.arange(-self.reach, self.reach + 1, dtype=torch.float64, device=raw.device)
         with torch.no_grad():
-            evidence = ambiguity_evidence(raw, radar, base, reference_spectrum(radar, self.reference, raw), turns)
+            evidence = ambiguity_evidence(cells, radar, base, reference_spectrum(radar, reference, cells), turns)
         joint = evidence["looks"] + evidence["lines"] + evidence["entropy"]
         best, nominal = turns[joint.argmax(-1)], radar.pointing_doppler_hz
         if nominal is not None:
             sure = torch.softmax(joint, -1).amax(-1) > doppler_assess.LEAST_PROBABILITY
             best = torch.where(sure, best, torch.round((nominal - base) / prf))
         first = base + prf * best
-        refined, std = complete_aperture_centroid(raw, radar, first, self.reference)
+        refined, std = complete_aperture_centroid(cells, radar, first, reference)
         found = Estimate(self._values(refined), quality=torch.ones_like(first), info={**evidence, "candidates": turns})
         if not self.assess:
             return found

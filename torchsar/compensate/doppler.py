@@ -19,11 +19,13 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate import doppler_assess
+from torchsar.compensate.pulse_phase.data import or_one
 from torchsar.core import (
     Estimate,
     Signal,
     Stage,
     checked_samples,
+    cis,
     differentiable,
     fft_lines,
     power_of,
@@ -104,6 +106,29 @@ def lag_products(x: Tensor, blocks: tuple[int, int] = (8, 8)) -> tuple[Tensor, T
     # the products of zeros are zero whatever they are divided by
     peak = torch.stack(peaks).amax(0).to(torch.float64)[..., None, None].clamp_min(1e-300)
     return torch.stack(products, -2) / peak, torch.stack(powers, -2) / peak
+
+
+def agreeing_cells(x: Tensor) -> Tensor:
+    """Weight range cells so that none decides a centroid alone.
+
+    Cells whose phase increment between adjacent lines departs from the median of all cells by more
+    than three robust standard deviations are set to zero, such as those of a target that moves on
+    its own. The power of the others is limited to the median.
+
+    Args:
+        x: Lines, shape (..., pulse, range), complex.
+
+    Returns:
+        The lines with weighted range cells, in the same shape.
+    """
+    x = unit_level(x)
+    products = torch.linalg.vecdot(x[..., :-1, :], x[..., 1:, :], dim=-2)
+    middle = torch.angle((products / or_one(products.abs())).sum(-1, keepdim=True))
+    away = torch.angle(products * cis(-middle))
+    away = (away - away.median(-1, keepdim=True).values).abs()
+    power = power_of(x).sum(-2)
+    limit = (power.median(-1, keepdim=True).values / or_one(power)).clamp_max(1).sqrt()
+    return x * (limit * (away <= 3 * 1.4826 * away.median(-1, keepdim=True).values))[..., None, :]
 
 
 def phase_increment(

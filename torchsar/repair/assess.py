@@ -64,6 +64,7 @@ def assess_imbalance(
     noise: Tensor,
     left_out: tuple[Tensor, Tensor],
     looks: tuple[float, float],
+    still: Tensor,
 ) -> dict[str, Any]:
     """Assess gains and phases of channels.
 
@@ -75,11 +76,13 @@ def assess_imbalance(
         noise: Noise power of each channel, 0 where it is not known, shape (..., channel).
         left_out: Gains and phases without one block of lines, shape (..., block, channel) each.
         looks: Samples of a channel, and samples over which its noise is averaged.
+        still: Share of the power that constants of the channels hold, shape (...,).
 
     Returns:
         Fields of an Estimate: NOISE where the coherence of neighbouring lines may be due to chance,
-        or a phase is that of noise. SINGULAR where a channel has no power. EMPTY for zeros. TOO_FEW
-        with fewer than 8 blocks of lines. INEXACT where a deviation exceeds 0.1.
+        or a phase is that of noise. SINGULAR where a channel has no power. EMPTY for zeros. AT_REST
+        where constants change the values. TOO_FEW with fewer than 8 blocks of lines. INEXACT where
+        a deviation exceeds 0.1.
     """
     product = gain * torch.roll(gain, 1, -1) / gain.square().mean(-1, keepdim=True)
     coherence = (lag.abs() / product.clamp_min(1e-300)).mean(-1).clamp(0, 1)
@@ -97,11 +100,16 @@ def assess_imbalance(
     outcome = worst(
         (Outcome.INEXACT, inexact.any(-1)),
         (Outcome.TOO_FEW, torch.full_like(known, left_out[0].shape[-2] < 8)),
+        # half of the deviation that is inexact
+        (Outcome.AT_REST, still > _MOST_IMBALANCE / 2),
         (Outcome.NOISE, ~known | chance),
         (Outcome.SINGULAR, ((gain < 1e-3) | (gain > 1e3)).any(-1)),
         (Outcome.EMPTY, power == 0),
     )
-    return {"std": {"gain": gain_std, "phase_rad": phase_std}, "quality": coherence, "outcome": outcome}
+    # constants were seen to change both by up to half of their share
+    own = still[..., None] / 2
+    std = {"gain": torch.hypot(gain_std, gain * own), "phase_rad": torch.hypot(phase_std, own)}
+    return {"std": std, "quality": coherence, "outcome": outcome}
 
 
 def of_trials(fields: dict[str, Any], trials: torch.Size) -> dict[str, Any]:

@@ -332,8 +332,9 @@ def estimate_imbalance(
         in radians, 0 for channel 0, which `correct_imbalance` removes. Standard deviations follow
         from blocks of lines that are left out in turn; `quality` is the coherence of neighbouring
         lines. The outcome is NOISE where this coherence may be due to chance, SINGULAR where a
-        channel has no power (gain outside 1e-3..1e3), TOO_FEW for fewer than 9 C lines, and INEXACT
-        where a standard deviation exceeds 0.1.
+        channel has no power (gain outside 1e-3..1e3), AT_REST where constants of the channels hold
+        more than a twentieth of the power, TOO_FEW for fewer than 9 C lines, and INEXACT where a
+        standard deviation exceeds 0.1.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -361,7 +362,10 @@ def estimate_imbalance(
     level = power.mean(-1) / power.amax(-1).clamp_min(1e-300)
     lag = product / (level * (x.shape[-2] // channels - 1)).clamp_min(1e-300)[..., None]
     looks = (x.shape[-1] * x.shape[-2] / channels, _looks(x, channels))
-    return Estimate(value, **assess_imbalance(gain, lag, power.mean(-1), noise, left_out, looks))
+    # share of the power that the constants of the converters hold
+    means = torch.stack([x[..., c::channels, :].mean((-2, -1)) for c in range(channels)], -1)
+    still = means.abs().square().mean(-1) / power.mean(-1).clamp_min(1e-300)
+    return Estimate(value, **assess_imbalance(gain, lag, power.mean(-1), noise, left_out, looks, still))
 
 
 def _phases(product: Tensor, channels: int, doppler_cycles: Tensor | float | None) -> Tensor:
