@@ -309,4 +309,5 @@ def test_a_report_begins_with_the_images_before_and_after() -> None:
         ("2.png", "3.png"), "Before and after", "text"
     )
     assert before_and_after([shown], ["recommended"]) == Picture(("3.png",), "Before and after", "text")
-    assert before_and_after([curves], ["none", "recommended"]) is None
+    assert before_and_after([curves], ["none", "recommended"]) == curves
+    assert before_and_after([Picture((), "A picture is missing", "")], ["recommended"]) is None

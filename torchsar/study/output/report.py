@@ -238,7 +238,7 @@ def draw_all(makers: Iterable[Callable[[], Drawn]], folder: Path) -> list[Pictur
     return pictures
 
 
-def before_and_after(pictures: Iterable[Picture], methods: Iterable[str]) -> Picture | None:
+def before_and_after(pictures: Sequence[Picture], methods: Iterable[str]) -> Picture | None:
     """Take the panels of the recommended method and of the first other one from a picture.
 
     Args:
@@ -246,7 +246,8 @@ def before_and_after(pictures: Iterable[Picture], methods: Iterable[str]) -> Pic
         methods: Names of the methods that process the data, in their order.
 
     Returns:
-        The picture of one or two panels, or None if no method has a panel.
+        The picture of one or two panels; the first picture if no method has a panel of its own, and
+        None if nothing was drawn.
     """
     before = next((name for name in methods if name != "recommended"), "")
     for picture in pictures:
@@ -255,7 +256,7 @@ def before_and_after(pictures: Iterable[Picture], methods: Iterable[str]) -> Pic
         if "recommended" in files:
             chosen = [files[name] for name in dict.fromkeys((before, "recommended")) if name in files]
             return Picture(tuple(chosen), "Before and after", picture.caption)
-    return None
+    return next((picture for picture in pictures if picture.files), None)
 
 
 def _drawn(make: Callable[[], Drawn]) -> Drawn:

@@ -239,8 +239,8 @@ class Geo(System):
         return {target: ideal_responses(radar, u_r, u_a, *known) for target, (u_r, u_a) in speeds.items()}
 
     def pictures(self, results: Mapping[str, Result]) -> Iterator[Callable[[], Drawn]]:
-        yield partial(comparisons, by_target(results), self.target_columns)
         yield from self.case_pictures(results)
+        yield partial(comparisons, by_target(results), self.target_columns)
 
     def pictured(self, result: Result) -> dict[str, Signal]:
         return {f"{name}/{target}": shot.image for name, of in shots(result).items() for target, shot in of.items()}
