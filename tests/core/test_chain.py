@@ -168,11 +168,18 @@ def test_axis_rejects_a_step_of_zero():
         Axis("range", 3, 0.0, 0.0, "m")
 
 
+def without_forward() -> nn.Module:
+    stage = nn.Identity()
+    stage.forward = None  # type: ignore[assignment]
+    return stage
+
+
 @pytest.mark.parametrize(
     ("stages", "error", "match"),
     [
         ({"a": OmegaK}, TypeError, "'a' must be a torch.nn.Module.* got the class OmegaK, not an instance"),
         ({"a": 3}, TypeError, "'a' must be a torch.nn.Module.* got int"),
+        ({"a": without_forward()}, TypeError, "'a' must be a torch.nn.Module with a method `forward`.* got Identity"),
         ({"forward": GivenVelocity()}, ValueError, "cannot be called 'forward'"),
         (
             {"lines": LineIntegrity()},

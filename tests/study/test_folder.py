@@ -13,11 +13,15 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
 import pytest
+import zarr
 
+from torchsar.io.arrays import refuse_changed_files, seal_files
 from torchsar.io.seal import sealed
 from torchsar.study.output.folder import STATE, _print_of, fresh_result, opened
 from torchsar.study.settings.errors import ConfigError
+from torchsar.study.settings.text import read_tree
 
 NAMES = ("metrics.json", "figures", "report.html")
 MINE = {"notes.txt": "mine", "figures.bak/old.png": "mine too", "OUT.old": "a name close to the result's"}
@@ -281,6 +285,24 @@ def test_a_damaged_manifest_is_a_sentence(content: str, out: Path) -> None:
     ):
         pytest.fail("must not begin")
     assert result(out) == whole("first", 3)
+
+
+def test_a_file_that_has_grown_is_not_read_into_memory(out: Path, tmp_path: Path) -> None:
+    """Sizes are checked first: 20 GB of a file with holes would fill the memory."""
+    os.truncate(out / STATE / "manifest.json", 20 << 30)
+    with pytest.raises(ConfigError, match="it has 21474836480 bytes, and may have"), opened(out, "run", NAMES):
+        pytest.fail("must not begin")
+    store = zarr.create_group(tmp_path / "store.zarr")
+    store["x"] = np.ones(3)
+    seal_files(store, tmp_path / "store.zarr")
+    os.truncate(tmp_path / "store.zarr" / "x" / "c" / "0", 20 << 30)
+    with pytest.raises(ValueError, match="differ from their checksum"):
+        refuse_changed_files(tmp_path / "store.zarr")
+    config = tmp_path / "recording.yaml"
+    config.touch()
+    os.truncate(config, 20 << 30)
+    with pytest.raises(ConfigError, match="21474836480 bytes are no config; name recorded data by data.file="):
+        read_tree(config)
 
 
 def test_a_manifest_that_is_a_pipe_is_not_waited_for(out: Path) -> None:

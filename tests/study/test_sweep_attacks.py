@@ -84,6 +84,9 @@ def test_long_arrays_have_addresses_of_all_their_numbers() -> None:
 def test_names_of_batched_parameters_are_a_list() -> None:
     with pytest.raises(ConfigError, match=r"write \['snr'\]"):
         make_grid({"snr": [1.0]}, "snr")
+    none: Any = None
+    with pytest.raises(ConfigError, match=r"batched must be a list of names, got None; write \[\]"):
+        make_grid({"snr": [1.0]}, none)
 
 
 # --- what a trial gives
@@ -187,13 +190,17 @@ def test_half_precision_images_are_kept(tmp_path: Path) -> None:
         ({"trials": 10**18}, "do not fit into memory"),
         ({"workers": 0}, "workers must be a whole number of at least 1, got 0"),
         ({"threads": 0}, "threads must be a whole number"),
+        ({"threads": None}, "threads must be a whole number of at least 1, got None"),
+        ({"trials": None}, "trials must be a whole number of at least 1, got None"),
+        ({"seed": None}, "seed must be a whole number of at least 0, got None"),
+        ({"out": b"x"}, "out must be the path of a folder, got b'x'"),
         ({"device": None}, "device None cannot be used"),
         ({"stop": Stop("ok", 0.1)}, "stop.metric names 'ok', which is no metric of the trials"),
     ],
 )
 def test_impossible_settings_are_refused(options: dict, said: str) -> None:
     with pytest.raises(ConfigError, match=said):
-        run(**options)
+        run(options.pop("out", None), **options)
 
 
 @pytest.mark.parametrize("numbers", [[99], [-1], "01", [True]])

@@ -117,7 +117,9 @@ def seal_files(root: Any, path: Path, free: str = "", **attributes: Any) -> None
         free: Folder of the store whose files may change, such as "image/c".
         **attributes: Values that JSON can hold.
     """
-    root.update_attributes(sealed({**attributes, "free": free, "files": _checksum_of(path, free)}))
+    kept = _kept(path, free)
+    about = {"free": free, "bytes": _bytes_of(kept), "files": files_checksum(path, kept)}
+    root.update_attributes(sealed({**attributes, **about}))
 
 
 def refuse_changed_files(path: Path) -> dict[str, Any]:
@@ -135,7 +137,9 @@ def refuse_changed_files(path: Path) -> dict[str, Any]:
     held = group_attributes(path)
     if not {"free", "files"} <= {*held}:
         raise ValueError("it has no checksum of its files, and was not written by this version of torchsar")
-    if held["files"] != _checksum_of(path, held["free"]):
+    kept = _kept(path, held["free"])
+    # sizes first, because a file may have become too large to be read
+    if held.get("bytes") not in (None, _bytes_of(kept)) or held["files"] != files_checksum(path, kept):
         raise ValueError("its files differ from their checksum, since one of them is damaged, missing or replaced")
     return held
 
@@ -156,12 +160,14 @@ def refuse_missing_chunks(array: Any) -> None:
         )
 
 
-def _checksum_of(path: Path, free: str) -> str:
-    """Checksum of all files but the metadata of the root, which hold it, and those that may
-    change.
-    """
-    kept = [file for file in plain_files(path) if not (free and file.is_relative_to(path / free))]
-    return files_checksum(path, [file for file in kept if file != path / "zarr.json"])
+def _kept(path: Path, free: str) -> list[Path]:
+    """All files but the metadata of the root, which hold the checksum, and free ones."""
+    files = [file for file in plain_files(path) if file != path / "zarr.json"]
+    return [file for file in files if not (free and file.is_relative_to(path / free))]
+
+
+def _bytes_of(files: list[Path]) -> int:
+    return sum(file.stat().st_size for file in files)
 
 
 def put(group: Any, name: str, value: Tensor, dims: tuple[str, ...] | None = None, **attributes: Any) -> None:

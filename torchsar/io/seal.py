@@ -69,9 +69,10 @@ def files_checksum(path: Path, files: Iterable[Path]) -> str:
     """
     found = hashlib.blake2b(digest_size=16)
     for file in files:
-        content = file.read_bytes()
-        found.update(f"{file.relative_to(path).as_posix()} {len(content)} ".encode())
-        found.update(content)
+        found.update(f"{file.relative_to(path).as_posix()} {file.stat().st_size} ".encode())
+        with file.open("rb") as content:
+            while block := content.read(1 << 20):
+                found.update(block)
     return found.hexdigest()
 
 
@@ -157,7 +158,26 @@ def document(path: Path) -> dict[str, Any]:
         ValueError: If the file is no JSON.
         OSError: If it cannot be read.
     """
-    return json.loads((path / "zarr.json").read_text("utf-8"))
+    return read_json(path / "zarr.json")
+
+
+def read_json(path: Path, most_bytes: int = 1 << 28) -> Any:
+    """Read a JSON file after a check of its size.
+
+    Args:
+        path: Path of the file.
+        most_bytes: Largest size, above that of the manifest of a million files.
+
+    Returns:
+        Its content.
+
+    Raises:
+        ValueError: If the file is larger, or is no JSON.
+        OSError: If it cannot be read.
+    """
+    if path.stat().st_size > most_bytes:
+        raise ValueError(f"it has {path.stat().st_size} bytes, and may have {most_bytes}")
+    return json.loads(path.read_text("utf-8"))
 
 
 def group_attributes(path: Path, ours: Mapping[str, Any] | None = None) -> dict[str, Any]:

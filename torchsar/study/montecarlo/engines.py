@@ -188,7 +188,7 @@ def engine(workers: int | None = None, cluster: str | None = None, threads: int 
         ModuleNotFoundError: If dask.distributed is not installed.
     """
     for name, value in (("workers", workers), ("threads", threads)):
-        if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
+        if (name, value) != ("workers", None) and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
             raise ConfigError(f"sweep: {name} must be a whole number of at least 1, got {value!r}")
     if workers is None and cluster is None:
         yield InProcess(threads)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -116,9 +116,10 @@ def make_grid(
     """
     if not isinstance(values, Mapping):
         raise ConfigError(f"{where} must be a mapping of names to lists of values, got {values!r}")
-    if isinstance(batched, str):
-        raise ConfigError(f"{where}: batched must be a list of names, got {batched!r}; write [{batched!r}]")
-    unknown = next((name for name in batched if name not in values), None)
+    if isinstance(batched, str) or not isinstance(batched, Iterable):
+        right = [batched] if isinstance(batched, str) else []
+        raise ConfigError(f"{where}: batched must be a list of names, got {batched!r}; write {right}")
+    unknown = next((name for name in batched if name not in [*values]), None)
     if unknown is not None:
         known = ", ".join(values) or "none"
         raise ConfigError(

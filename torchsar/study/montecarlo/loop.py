@@ -119,7 +119,8 @@ class Plan:
 
     def __post_init__(self) -> None:
         for name, value, least in (("trials", self.trials, 1), ("chunk", self.chunk, 1), ("seed", self.seed, 0)):
-            if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < least):
+            whole = isinstance(value, int) and not isinstance(value, bool) and value >= least
+            if not whole and (name, value) != ("chunk", None):
                 raise ConfigError(f"sweep: {name} must be a whole number of at least {least}, got {value!r}")
         absent = next((t for t in self.save if type(t) is not int or not 0 <= t < self.trials), None)
         if absent is not None:
@@ -233,6 +234,7 @@ def sweep(
         ("config", isinstance(config or {}, Mapping), "be a mapping of what else results depend on", config),
         ("random", random in get_args(Source), f"be one of {', '.join(get_args(Source))}", random),
         ("version", version is None or isinstance(version, (str, int)), "be a word or a whole number", version),
+        ("out", out is None or isinstance(out, (str, Path)), "be the path of a folder", out),
     ):
         if not good:
             raise ConfigError(f"sweep: {name} must {expected}, got {given!r}")

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torchsar.io.seal import is_sealed, sealed
+from torchsar.io.seal import is_sealed, read_json, sealed
 from torchsar.study.settings.errors import ConfigError
 
 try:
@@ -153,7 +153,7 @@ class ResultFolder:
         if path.exists() and not path.is_file():
             raise ConfigError(f"{path} is no file; choose another folder, or remove it")
         try:
-            tree = json.loads(path.read_text(encoding="utf-8"))
+            tree = read_json(path)
         except FileNotFoundError:
             return {"kind": None, "files": {}, "old": None}
         except (OSError, ValueError, RecursionError) as error:

@@ -167,12 +167,15 @@ def find_config(name: str) -> Path:
 def read_tree(path: Path) -> dict[str, Any]:
     """Return the mapping in a config file. Raises ConfigError if the file holds no mapping."""
     try:
+        if path.stat().st_size > 1 << 24:
+            raise ConfigError(f"{path}: {path.stat().st_size} bytes are no config; name recorded data by data.file=")
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read as text ({error})") from None
     tree = parse(text, str(path))
     if not isinstance(tree, dict):
-        raise ConfigError(f"{path}: a config must be a mapping of sections, got {type(tree).__name__}")
+        kind = "an empty file" if tree is None else type(tree).__name__
+        raise ConfigError(f"{path}: a config must be a mapping of sections, got {kind}")
     return tree
 
 

@@ -437,6 +437,6 @@ def reason_of(error: Exception) -> str:
     Returns:
         The text of the error in one line, with its kind where the text alone may say too little.
     """
-    if isinstance(error, _PLAIN) and one_line(error):
+    if isinstance(error, _PLAIN) and " " in one_line(error):  # a single word says too little
         return one_line(error)
     return f"{type(error).__name__}: {one_line(error) or 'no message'}{own_line(error)}"
