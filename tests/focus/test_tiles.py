@@ -410,6 +410,19 @@ def test_pulses_at_the_ends_of_a_wide_arc_stay_within_the_window(step: float, wa
     assert drawn.error_db(drawn.plan(wanted).image(noise)) < wanted
 
 
+def test_a_window_keeps_the_error_where_the_path_hardly_changes() -> None:
+    """On a short path all pixels lie at the same places between the samples of a window."""
+    along = torch.linspace(-2.2, 2.2, 83, dtype=F64)
+    place = torch.stack([along, torch.full_like(along, -1000.0), torch.full_like(along, 847.4)], -1)
+    grid = ImageGrid(torch.tensor([-2.98, -4.94, 0.0], dtype=F64), torch.eye(2, 3, dtype=F64), (51, 84), 0.119144)
+    frequency = 9.0494e9 + 17.2077e6 * torch.arange(64, dtype=F64)
+    plan = TilePlan(frequency, place, None, 2 * place.norm(dim=-1), grid, -45.0, images=None)
+    noise = torch.randn(8, 83, 64, generator=torch.Generator().manual_seed(1), dtype=torch.complex64)
+    exact = plan.exact(noise.to(C128), grid.pixels_m().reshape(-1, 3)[::7], eps=1e-6)
+    left = (plan.image(noise).flatten(-2)[..., ::7] - exact).norm() / exact.norm()
+    assert 20 * math.log10(float(left)) < -44
+
+
 def pointed(place: Tensor, points: Tensor, width: float, looks: Tensor | float = 0.0) -> Tensor:
     """Gaussian pattern over the sine of the angle ahead of broadside, less that of each look."""
     away = points[:, None] - place
