@@ -361,7 +361,10 @@ MISTAKES: dict[str, tuple[dict[str, Any], list[str]]] = {
         {"samples.order": "iiqqiq", "samples.dims": ["pulse", "range", "iq"]},
         ["order must have as many i as q", "divides that of the samples, 40, got 'iiqqiq'"],
     ),
-    "an offset": ({"samples.offset": [1.0, 2.0, 3.0]}, ["offset must be a number", "[1.0, 2.0, 3.0]"]),
+    "an offset": (
+        {"samples.offset": [1.0, 2.0, 3.0]},
+        ["offset must be one finite number, or one for I and Q", "[1.0, 2.0, 3.0]"],
+    ),
     "imag beside iq": ({"samples.imag": "iq/data"}, ["samples must be complex, or real with one dim iq or one array"]),
 }
 

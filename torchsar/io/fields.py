@@ -185,11 +185,11 @@ def shown(field: StoredArray) -> str:
         field: The field.
 
     Returns:
-        The value of a short field without dimensions, the type and the shape of any other.
+        The values of a short field, the type and the shape of any other.
     """
-    # largest number of bytes of a value that is shown in a message
-    short = not field.shape and field.dtype.itemsize <= 64
-    return repr(field.load().item()) if short else field.described
+    # largest number of bytes of values that are shown in a message
+    short = len(field.shape) < 2 and field.dtype.itemsize * math.prod(field.shape) <= 64
+    return repr(field.load().tolist()) if short else field.described
 
 
 def complex_type(dtype: np.dtype) -> np.dtype:

@@ -25,7 +25,7 @@ from torchsar.io.containers import Container, flat_array, open_container
 from torchsar.io.extras import write_whole
 from torchsar.io.fields import Described, Level, complex_type, joined, naming, parted
 from torchsar.io.history import describe_inverse, describe_path
-from torchsar.io.strip import describe_stripmap
+from torchsar.io.strip import describe_stripmap, offset_of
 from torchsar.spelling import did_you_mean
 
 # size in bytes of a block of complex samples, large enough for fast reading
@@ -227,7 +227,7 @@ def import_recording(path: str | Path, sidecar: Mapping[str, Any], out: str | Pa
                 unit, along = known[one]
                 x = _value(file, value, f"{where}.{one}", unit, lengths.get(along))
                 arrays[one] = x = x.reshape(()) if section == "radar" and x.size == 1 else x
-                stored[one] = StoredArray(f"{where}.{one}", x.shape, x.dtype, x.__getitem__)
+                stored[one] = _stored(f"{where}.{one}", x)
         stored[key] = StoredArray(f"{name}: samples", shape, samples.dtype, samples.part)
         found = kind.describe(stored, Path(name))
         # adds the name of the sidecar to errors of side data that are only checked when a recording
@@ -293,7 +293,10 @@ def _samples(file: _File, tree: Mapping[str, Any], where: str, order: tuple[str,
             f"{parts[0].dtype.name} with the dims {dims}{' and imag' if len(parts) == 2 else ''}"
         )
     slow = next(one for one in dims if one in order)
-    turn, offset = _order(tree, where, dims, shape, slow), _offset(tree, where)
+    turn, offset = (
+        _order(tree, where, dims, shape, slow),
+        offset_of(_stored(f"{where}.offset", _numbers(tree.get("offset", 0), f"{where}.offset", ""))),
+    )
     table = None if "table" not in tree else _array(file, file.path, {"name": tree["table"]}, where).load().ravel()
     if table is not None and not kinds <= {"i", "u"}:
         raise ValueError(f"{where}.table: samples must be whole numbers, indices of it, got {parts[0].dtype.name}")
@@ -332,13 +335,9 @@ def _order(
     return lambda x: parted(np.moveaxis(x, dims.index("iq"), -1), order)
 
 
-def _offset(tree: Mapping[str, Any], where: str) -> complex:
-    """Complex offset that is subtracted from the samples."""
-    given = tree.get("offset", 0)
-    both = list(given) if isinstance(given, (list, tuple)) else [given, given]
-    if len(both) != 2 or not all(type(x) in (int, float) and abs(x) < 1e300 for x in both):
-        raise ValueError(f"{where}.offset must be {_SAMPLES['offset'][1]}, got {given!r}")
-    return complex(*both)
+def _stored(what: str, array: np.ndarray) -> StoredArray:
+    """An array in memory, for the functions that check arrays in files."""
+    return StoredArray(what, array.shape, array.dtype, array.__getitem__)
 
 
 def _array(file: _File, path: Path, tree: Mapping[str, Any], where: str) -> StoredArray:

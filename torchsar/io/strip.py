@@ -180,7 +180,7 @@ def describe_stripmap(fields: Mapping[str, StoredArray], path: Path) -> Describe
         if "slant_range_cell1_m" in per_line:
             start = per_line["slant_range_cell1_m"].numpy()
             aux["window_start_m"] = start + (radar.near_range_m - start.min())
-    return Described(iq, radar, aux, partial(_samples, offset=_offset(fields)))
+    return Described(iq, radar, aux, partial(_samples, offset=offset_of(fields.get("offset"))))
 
 
 def _samples(iq: np.ndarray, offset: complex) -> np.ndarray:
@@ -191,15 +191,23 @@ def _samples(iq: np.ndarray, offset: complex) -> np.ndarray:
     return data - offset if offset else data
 
 
-def _offset(fields: Mapping[str, StoredArray]) -> complex:
-    """Offset of the recorded samples from their true values, I + j Q."""
-    if "offset" not in fields:
+def offset_of(field: StoredArray | None) -> complex:
+    """Return the offset of recorded samples from their true values.
+
+    Args:
+        field: One number, or one for I and Q; None for no offset.
+
+    Returns:
+        The offset, I + j Q.
+
+    Raises:
+        ValueError: If the field holds anything else.
+    """
+    if field is None:
         return 0
-    both = np.broadcast_to(fields["offset"].load("iuf"), 2) if fields["offset"].shape in ((), (1,), (2,)) else None
+    both = np.broadcast_to(field.load("iuf"), 2) if field.shape in ((), (1,), (2,)) else None
     if both is None or not np.isfinite(both).all():
-        raise ValueError(
-            f"{fields['offset'].what} must be one finite number, or one for I and Q, got {shown(fields['offset'])}"
-        )
+        raise ValueError(f"{field.what} must be one finite number, or one for I and Q, got {shown(field)}")
     return complex(*both.tolist())
 
 
