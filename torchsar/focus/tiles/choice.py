@@ -130,8 +130,8 @@ def choose(scene: Scene, error_db: float, images: float | None) -> Choice:
             best = min(best, error)
         else:
             kernel = kernel_error(taps, *turns)
-            # The error of a window is a mean over the places of pixels between its samples. Where the
-            # path hardly changes over the pulses, its power can be twice as large.
+            # The error of a window is a mean over the places of pixels between its samples. Where
+            # the path hardly changes over the pulses, its power can be twice as large.
             found = _choose_slope(scene, sampled, math.sqrt((left**2 - kernel**2) / 2))
             if found is not None:
                 slope, window = found
