@@ -219,3 +219,16 @@ def test_a_recording_of_trials_is_indexed_with_its_side_data():
     alike = Recording(Signal(torch.zeros(4, 4, 3), axes), None, {"line_number": torch.arange(4)})
     with pytest.raises(ValueError, match="aux.line_number of shape .4,. may have an entry for each of the 4 trials"):
         alike[0]
+
+
+def test_a_signal_is_multiplied_by_numbers_and_tensors() -> None:
+    axes = Axis("pulse", 3, 0.0, 1.0, "s"), Axis("range", 4, 0.0, 1.0, "m")
+    signal = Signal(torch.ones(2, 3, 4, dtype=torch.complex64), axes)
+    phase = torch.polar(torch.ones(3), torch.arange(3.0))[:, None]
+    for product in (signal * phase, phase * signal, 1 * (signal * phase)):
+        assert isinstance(product, Signal) and product.axes == axes
+        assert torch.equal(product.data, signal.data * phase)
+    with pytest.raises(TypeError, match="for two, multiply their samples"):
+        _ = signal * signal
+    with pytest.raises(ValueError, match="must end in dimensions of the lengths of its axes"):
+        _ = signal.isel(range=slice(0, 1)) * torch.ones(4)

@@ -198,6 +198,16 @@ class Signal(Shown):
         """Amplitudes of the samples, a tensor."""
         return self.data.abs()
 
+    def __mul__(self, factor: Any) -> Signal:
+        """Samples times a number, or times a tensor that broadcasts with them, on the same axes."""
+        if isinstance(factor, Signal):
+            raise TypeError(
+                "a Signal is multiplied by a number or a tensor; for two, multiply their samples: a.data * b.data"
+            )
+        return self.with_data(self.data * factor)
+
+    __rmul__ = __mul__
+
     def __getitem__(self, index: Any) -> Signal:
         """Choose trials, as `signal[0]` or `signal[:, 2:5]`; `isel` and `sel` choose samples.
 
