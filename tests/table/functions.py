@@ -572,11 +572,6 @@ FUNCTIONS = [
         ),
     ),
     _entry(
-        "multichannel.estimate_balance",
-        "range",
-        lambda x: multichannel.estimate_balance(x, BISTATIC, multichannel.FlatBand(300.0), 3, blocks=4),
-    ),
-    _entry(
         "multichannel.correct_migration",
         "range",
         on(
