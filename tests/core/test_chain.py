@@ -168,10 +168,12 @@ def test_axis_rejects_a_step_of_zero():
         Axis("range", 3, 0.0, 0.0, "m")
 
 
-def without_forward() -> nn.Module:
-    stage = nn.Identity()
-    stage.forward = None  # type: ignore[assignment]
-    return stage
+class WithoutForward(nn.Module):
+    """A module whose `forward` is a value."""
+
+    @property
+    def forward(self):
+        raise KeyError("forward")
 
 
 @pytest.mark.parametrize(
@@ -179,7 +181,7 @@ def without_forward() -> nn.Module:
     [
         ({"a": OmegaK}, TypeError, "'a' must be a torch.nn.Module.* got the class OmegaK, not an instance"),
         ({"a": 3}, TypeError, "'a' must be a torch.nn.Module.* got int"),
-        ({"a": without_forward()}, TypeError, "'a' must be a torch.nn.Module with a method `forward`.* got Identity"),
+        ({"a": WithoutForward()}, TypeError, "'a' must be a torch.nn.Module with a method `forward`.* got Without"),
         ({"forward": GivenVelocity()}, ValueError, "cannot be called 'forward'"),
         (
             {"lines": LineIntegrity()},

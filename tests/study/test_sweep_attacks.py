@@ -193,6 +193,7 @@ def test_half_precision_images_are_kept(tmp_path: Path) -> None:
         ({"threads": None}, "threads must be a whole number of at least 1, got None"),
         ({"trials": None}, "trials must be a whole number of at least 1, got None"),
         ({"seed": None}, "seed must be a whole number of at least 0, got None"),
+        ({"out": "x" * 300}, "cannot be written: .*too long.*; choose another folder"),
         ({"out": b"x"}, "out must be the path of a folder, got b'x'"),
         ({"device": None}, "device None cannot be used"),
         ({"stop": Stop("ok", 0.1)}, "stop.metric names 'ok', which is no metric of the trials"),

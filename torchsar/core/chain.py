@@ -472,7 +472,7 @@ def _check_member(name: str, stage: object) -> None:
     """Raise an error unless a member is a module with `forward` whose name nn.ModuleDict does not
     reserve.
     """
-    if not isinstance(stage, nn.Module) or not callable(getattr(stage, "forward", None)):
+    if not isinstance(stage, nn.Module) or not callable(getattr(type(stage), "forward", None)):
         got = f"the class {stage.__name__}, not an instance of it" if isinstance(stage, type) else type(stage).__name__
         raise TypeError(f"stage {name!r} must be a torch.nn.Module with a method `forward`, such as a Stage, got {got}")
     if hasattr(nn.ModuleDict(), name) or "." in name:

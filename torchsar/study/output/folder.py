@@ -267,7 +267,7 @@ def _locked(out: Path) -> Any:
 
 def _refuse_links(out: Path, *paths: Path) -> None:
     for path in paths:
-        if path.is_symlink():
+        if os.path.islink(path):
             raise ConfigError(f"--out {out}: {path} is a link, not made by torchsar; choose another folder")
 
 
