@@ -25,7 +25,7 @@ from torchsar.repair import (
 )
 from torchsar.repair.jitter import Exact, correct_jitter_exact
 from torchsar.repair.jitter_blind import detect_jitter_period
-from torchsar.study.bench.repairs import jitter
+from torchsar.study.bench.repairs import jitter, speckle
 
 OFFSETS = torch.tensor([0.0, 0.18, -0.12, 0.07], dtype=torch.float64)
 
@@ -309,3 +309,14 @@ def test_noise_of_the_converter_is_distinguished_from_noise_with_jitter(converte
     assert float(sure.double().mean()) > 0.8 and 0.67 < float(error / std) < 1.43
     gain = (found["offset_samples"] * true).sum() / true.square().sum()
     assert abs(float(gain) - 1) < 0.05
+
+
+def test_a_period_beyond_the_search_is_named() -> None:
+    """A divisor of the period was found, and the rest of the jitter was left without a word."""
+    draws = Draws(7, trials=range(6))
+    scene = 10 * speckle(draws, 64, 512)
+    noise = draws.normal("noise", (64, 512), torch.complex128)
+    offsets = 0.1 * draws.normal("offsets", (20,)).clamp(-2, 2)
+    jittered = sample_unevenly(scene, offsets - offsets.mean(-1, keepdim=True)) + noise
+    found, clean = (estimate_jitter_blind(x, max_period=8) for x in (jittered, scene + noise))
+    assert bool((found.outcome == Outcome.OUTSIDE_SEARCH).all()) and bool(clean.ok.all())

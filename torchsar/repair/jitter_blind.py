@@ -421,9 +421,10 @@ def estimate_jitter_blind(
         for the longest period. `quality` is m / (m + v), with the mean square m of the offsets and
         the variance v of their errors, or 1 where there is no jitter. The outcome is EMPTY for
         zeros, SINGULAR where offsets would coincide or cross, NOISE where less than half of the
-        power is above the noise, MISFIT where the rms of the offsets is 0.22 samples or more, and
-        INEXACT where the standard deviation is 0.01 samples or more for the longest period tested
-        (so for a scene of one or few points, whose lines resemble each other).
+        power is above the noise, OUTSIDE_SEARCH where corrected lines still repeat with another
+        period, MISFIT where the rms of the offsets is 0.22 samples or more, and INEXACT where the
+        standard deviation is 0.01 samples or more for the longest period tested (so for a scene of
+        one or few points, whose lines resemble each other).
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -445,6 +446,7 @@ def estimate_jitter_blind(
     )
     offsets, std = (torch.zeros((rows.shape[0], longest), dtype=torch.float64, device=y.device) for _ in range(2))
     tiled = torch.arange(longest, device=y.device)
+    rest = torch.zeros_like(periods, dtype=torch.bool)
     for m in torch.unique(periods).tolist():
         chosen = (periods == m).nonzero()[:, 0]
         if m > 1:
@@ -452,6 +454,8 @@ def estimate_jitter_blind(
             offsets[chosen], std[chosen] = total[:, tiled % m], deviation[:, None].expand(-1, longest)
         elif assess:
             std[chosen] = cyclic_fit(rows[chosen], longest)[1].sum(-1).sqrt()[:, None].expand(-1, longest)
+        if assess:
+            rest[chosen] = _has_period(rows[chosen], offsets[chosen, :m])
     value = {
         "offset_samples": uncrossed(offsets).reshape(*y.shape[:-2], longest),
         "period": periods.reshape(y.shape[:-2]),
@@ -463,7 +467,23 @@ def estimate_jitter_blind(
     lit = (rows != 0).any(-1).any(-1)
     tested = std[:, 0] * torch.sqrt((longest - 1) / (torch.where(periods == 1, longest, periods) - 1))
     fields = assess_offsets(offsets, std, tested, _signal_share(rows) >= 0.5, lit, quality, most_rms=0.22)
+    fields["outcome"] = torch.maximum(fields["outcome"], Outcome.OUTSIDE_SEARCH.like(rest) * rest)
     return Estimate(value, **of_trials(fields, y.shape[:-2]))
+
+
+def _has_period(y: Tensor, offsets: Tensor) -> Tensor:
+    """True where lines (trial, pulse, range), corrected with offsets (trial, M), still repeat along
+    range with any period, (trial,).
+    """
+    m = offsets.shape[-1]
+    y = unit_level(y[..., : y.shape[-1] - y.shape[-1] % m])
+    y = correct_jitter_exact(y, uncrossed(offsets)) if m > 1 else y
+    product = (y[..., 1:] * y[..., :-1].conj()).mean(-2)
+    window = torch.hann_window(product.shape[-1], dtype=product.real.dtype, device=y.device)
+    power = torch.fft.fft((product - product.mean(-1, keepdim=True)) * window).abs().square()
+    # the spectrum of a scene is wide; one of its n values is as high with a probability of exp(-5)
+    high = power > (math.log(power.shape[-1]) + 5) * _smooth(power, 65)
+    return high[..., 33:-33].any(-1)
 
 
 def _signal_share(y: Tensor) -> Tensor:
