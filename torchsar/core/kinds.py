@@ -109,7 +109,9 @@ def _accepts_all(hint: Any) -> bool:
 
 
 def _fitted(value: Any, hint: Any) -> Any:
-    """The value in the form that a hint names, or _UNFIT."""
+    """An argument converted to the type of its annotation `hint`, or `_UNFIT` if it has no such
+    form.
+    """
     origin, inner = typing.get_origin(hint), typing.get_args(hint)
     if origin in _UNIONS:
         return next((form for one in inner if (form := _fitted(value, one)) is not _UNFIT), _UNFIT)

@@ -86,10 +86,8 @@ def trilinear(wanted: str, size: int, first: Tensor, a: Tensor, b: Tensor) -> Te
 
 
 class _Trilinear(torch.autograd.Function):
-    """One partial derivative of the trilinear form.
-
-    a and b are the other two factors in the order of _PARTS; `size` is the number of taps or grid
-    rows of the result.
+    """Partial derivative of the trilinear form by one of its factors, as an operation of autograd;
+    arguments as in `trilinear`.
     """
 
     @staticmethod

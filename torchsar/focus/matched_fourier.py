@@ -51,7 +51,8 @@ from torchsar.radar.warp import least_rate, warp, warp_rate
 
 # shorter records are rejected as invalid input, by choice
 MIN_PULSES = 8
-# defaults of the transform: the whole pulse rate at two lines per Doppler cell, by gridding
+# By default the image covers Doppler frequencies of one pulse rate, with two lines per Doppler
+# cell, and the sums are computed by gridding.
 _DOPPLER_LINES, _GRIDDING = DopplerLines(), Gridding()
 
 

@@ -127,7 +127,8 @@ def read_track(file: str | Path, origin: Sequence[float] | None = None) -> Track
                 f"{path} has no line of names, and columns 2 and 3 ({place[0, 0]:g}, {place[0, 1]:g}) hardly change, "
                 "as degrees do; write time,lat,lon,height or time,x,y,z into its first line"
             )
-        # slower than any platform but a rail, and a degree is 111 km
+        # Coordinates that change by less than 2 cm/s are those of a slow rail in metres, or of any
+        # other platform in degrees, of which one is 111 km.
         if unnamed and size[0] <= 90 and size[1] <= 360 and float(reach.max()) < 0.02 * float(time_s[-1] - time_s[0]):
             warnings.warn(
                 f"{path} has no line of names and is read as time, x, y, z in metres, which move by "

@@ -160,8 +160,8 @@ def _chirp(frequency: Tensor, rate: Tensor, time: Tensor, dtype: torch.dtype) ->
 
 
 def _segments(n: int) -> tuple[int, int]:
-    """Number of segments of n pulses, and number of pulses of each of the `_PARTS` samples of a
-    segment.
+    """Number of segments into which n pulses are divided, and number of pulses that are summed to
+    one sample; a segment has `_PARTS` samples.
     """
     segments = max(4, 2 ** round(math.log2(n) / 2))
     return segments, -(-n // (_PARTS * segments))

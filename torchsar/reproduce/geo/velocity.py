@@ -161,7 +161,9 @@ def _draws(small: bool) -> Draws:
 
 
 def _over_velocity(small: bool) -> Columns:
-    """Errors of Table 3 at a raw SCNR of -10 dB. The reduced form has one velocity."""
+    """Velocity errors at a raw SCNR of -10 dB for each velocity of Table 3; only one of them in a
+    small run.
+    """
     draws, at = _draws(small), [1.0] if small else list(TABLE_3)
     return {"": [_errors(RADAR, u_r, -10.0, draws.part(f"{u_r:g} m/s"), 3) for u_r in at]}, at
 
