@@ -113,7 +113,7 @@ def _one(
     radar = replace(RADAR, keep_every=24) if small else RADAR
     motion, amplitude = (*MOTION, PathFluctuation(1.5e-6 * strength)), LogAmplitude(0.1 * strength)
     world = LadarWorld(RetroAndBrokenLine(), motion, amplitude, snr_db, fidelity=EverySample())
-    # blocks that contain a period from the trigger on
+    # the record consists of blocks, each long enough for one period after its trigger
     how = {"block_s": BLOCK_S, "trigger_s": TRIGGER_S, "trigger_known": True}
     recording, truth = simulate_ladar_record(radar, world, 3840 // radar.keep_every, Draws(seed), **how)
     assert truth.clean is not None
