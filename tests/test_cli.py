@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import re
 import resource
 import signal
@@ -450,3 +451,16 @@ def test_requires_prints_the_table_and_writes_it(tmp_path: Path, capsys: pytest.
 def test_trade_refuses_what_it_does_not_know(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["trade", str(write_tiny(tmp_path)), "trade.focusers=[omega_k]"]) == 2
     assert "'trade.focusers' is not known (accepted: repeats, tolerance, trials)" in spoken(capsys)[-1]
+
+
+def test_threads_wait_passively_before_torch_is_imported() -> None:
+    words = "import os, sys; from torchsar.cli import main; main(['--version']); assert 'torch' not in sys.modules"
+    given = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    done = subprocess.run(
+        [sys.executable, "-c", f"{words}; print(os.environ['OMP_WAIT_POLICY'])"],
+        env=given,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.splitlines()[-1] == "PASSIVE"

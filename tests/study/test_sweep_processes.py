@@ -296,11 +296,43 @@ def answer(port: int) -> bytes:
         return b""
 
 
+class Busy:
+    """Numbers of trials that run now, and that ran at once at most, in this process."""
+
+    lock, now, most = threading.Lock(), 0, 0
+
+
+def counted(parameters: dict, draws) -> dict:
+    with Busy.lock:
+        Busy.now += 1
+        Busy.most = max(Busy.most, Busy.now)
+    time.sleep(0.1)
+    with Busy.lock:
+        Busy.now -= 1
+    return toy.trial(parameters, draws)
+
+
 @needs_dask
-def test_workers_listen_on_loopback_and_never_to_web_browsers_or_other_users() -> None:
+def test_workers_that_come_late_get_work() -> None:
+    from distributed import LocalCluster
+
+    with LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None, silence_logs=50
+    ) as cluster:
+        add = threading.Timer(0.5, cluster.scale, args=(8,))
+        add.start()
+        # the queue of the single worker at the start holds 4 chunks
+        toy.run(trial=counted, cluster=cluster.scheduler_address, chunk=1, trials=25)
+        add.join()
+    assert Busy.most > 4
+
+
+@needs_dask
+def test_workers_listen_on_loopback_and_never_to_web_browsers_or_other_users(monkeypatch: pytest.MonkeyPatch) -> None:
     import psutil
     from distributed import Client
 
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
     found, ended = dict[tuple[str, int], bytes](), threading.Event()
 
     def look() -> None:
@@ -317,6 +349,7 @@ def test_workers_listen_on_loopback_and_never_to_web_browsers_or_other_users() -
     try:
         with engine(workers=2) as ours:
             address = ours.client.scheduler.address
+            assert set(ours.client.run(os.getenv, "OMP_WAIT_POLICY").values()) == {"PASSIVE"}
             work = Work(toy.trial, make_grid(toy.GRID, ["snr_db"]), Draws(5))
             assert len([*ours.results(work, [(Chunk(0, (0,), (0,)), None)])]) == 1
             with pytest.raises((OSError, TypeError)):
