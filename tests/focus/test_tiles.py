@@ -423,6 +423,19 @@ def test_a_window_keeps_the_error_where_the_path_hardly_changes() -> None:
     assert 20 * math.log10(float(left)) < -44
 
 
+def test_weights_that_change_beyond_the_image_are_those_of_its_pixels() -> None:
+    """The last tiles are filled in part, and the beam ends behind the last pixel."""
+    along = torch.linspace(-4.85, 4.85, 160, dtype=F64)
+    place = torch.stack([along, torch.full_like(along, -300.0), torch.full_like(along, 189.0)], -1)
+    grid = ImageGrid(torch.tensor([-15.6, -9.4, 0.0], dtype=F64), torch.eye(2, 3, dtype=F64), (69, 42), 0.458)
+    beam, frequency = ProcessedBeam(7.027), 9.458e9 + 4.442e6 * torch.arange(64, dtype=F64)
+    given = grid, -30.0, partial(beam.lit_pulses, place), partial(beam.pulse_weights, place)
+    plan = TilePlan(frequency, place, None, 2 * place.norm(dim=-1), *given, images=None)
+    noise = torch.randn(4, 160, 64, generator=torch.Generator().manual_seed(1), dtype=torch.complex64)
+    exact = plan.exact(noise.to(C128), grid.pixels_m().reshape(-1, 3), eps=1e-6)
+    assert 20 * math.log10(float((plan.image(noise).flatten(-2) - exact).norm() / exact.norm())) < -28
+
+
 def pointed(place: Tensor, points: Tensor, width: float, looks: Tensor | float = 0.0) -> Tensor:
     """Gaussian pattern over the sine of the angle ahead of broadside, less that of each look."""
     away = points[:, None] - place

@@ -13,7 +13,7 @@ import copy
 import functools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -201,6 +201,7 @@ class Scene:
     grid: ImageGrid
     lit: Lit | None = None
     weight: Weight | None = None
+    _known: dict[tuple[int, int, float], tuple[int, float]] = field(default_factory=dict, init=False)
 
     @functools.cached_property
     def farthest(self) -> list[Tensor]:
@@ -298,11 +299,6 @@ class Scene:
         at = torch.minimum((at + (2 * place - 1) * half).maximum(half), most)
         return self._points(*(v[:, None] for v in at.to(self.grid.origin_m.device).unbind(-1)))[:, 0, 0]
 
-    @functools.cached_property
-    def _known(self) -> dict[tuple[int, int, float], tuple[int, float]]:
-        """Results that `points` has found."""
-        return {}
-
     def points(self, axis: int, size: int, error: float) -> tuple[int, float]:
         """Find the number of points of a tile between which weights are interpolated.
 
@@ -316,23 +312,26 @@ class Scene:
         """
         if not self.weighted:
             return 1, 0.0
-        if (axis, size, error) not in self._known:
-            self._known[axis, size, error] = self._points_found(axis, size, error)
-        return self._known[axis, size, error]
+        key = axis, size, error
+        return self._known.get(key) or self._known.setdefault(key, self._points_found(*key))
 
     def _points_found(self, axis: int, size: int, error: float) -> tuple[int, float]:
         """Compute the result of `points`."""
-        device, step = self.grid.origin_m.device, self.grid.step_m
+        device, step, n = self.grid.origin_m.device, self.grid.step_m, self.grid.counts[axis]
+        along, number = self.grid.axes[axis], torch.arange(size, dtype=torch.float64, device=device)
         centre = self._some_tiles(*((size, 1) if axis == 0 else (1, size)))
-        at = (torch.arange(size, dtype=torch.float64, device=device) - (size - 1) / 2) * step
-        true = self.weights(centre[:, None] + at[:, None] * self.grid.axes[axis])
-        power = true.square().sum().clamp_min(torch.finfo(true.dtype).tiny)
-        for known in (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 24):
-            if known >= size:
-                break
+        # the last tiles may extend beyond the image, where weights may change faster
+        inside = (number < n % size).to(number)
+        last = (n // size * size + (size - 1) / 2) * step - (centre - self.grid.origin_m) @ along
+        centre = torch.stack([centre, centre + last[:, None] * along])
+        share = torch.stack([torch.full_like(inside, n // size), inside])[:, None, :, None]
+        at = (number - (size - 1) / 2) * step
+        true = self.weights(centre[:, :, None] + at[:, None] * along)
+        power = (share * true.square()).sum().clamp_min(torch.finfo(true.dtype).tiny)
+        for known in (k for k in (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 24) if k < size):
             known_at, matrix = interpolation(at, known)
-            left = true - matrix @ self.weights(centre[:, None] + known_at[:, None] * self.grid.axes[axis])
-            found = math.sqrt(float(left.square().sum() / power))
+            left = true - matrix @ self.weights(centre[:, :, None] + known_at[:, None] * along)
+            found = math.sqrt(float((share * left.square()).sum() / power))
             if found <= error:
                 return known, found
         return size, 0.0
