@@ -34,9 +34,10 @@ def omega_k_stolt(
     """Focus by omega-K with Stolt interpolation.
 
     The image of a target is focused exactly at every range. Coordinates and phases are those of
-    `omega_k`, and for narrow swaths without squint the two functions give the same image. The
-    computation takes two to three times as long as `omega_k`. Differentiable in the raw data, the
-    velocity and `frame_hz`.
+    `omega_k`, and for narrow swaths without squint the two functions give the same image. In
+    complex64 the computation takes about 1.6 times as long as `omega_k` while the Stolt shift is
+    below a tenth of a frequency bin, and up to three times beyond a bin. Differentiable in the raw
+    data, the velocity and `frame_hz`.
 
     All range frequencies f have equal weights, as in every form of omega-K. At lower frequencies
     the Doppler of an echo changes more slowly, its spectrum is higher, and the direct sum, a
