@@ -79,6 +79,11 @@ LIMITS: dict[str, dict[tuple[str, str], str]] = {
         ("path", "strip, 3 mm, 0 dB"): "autofocus, entropy_fixed_point",
         ("path", "strip, 3 mm, 20 dB"): "autofocus",
     },
+    "scatterers in evenly spaced range cells: displacements by their distance are nearly as likely, which `single` "
+    "confuses, and which the deviation of the others counts": {
+        ("alignment", "even rows, 10 dB"): "align_envelopes, AlignEnvelopes, align_envelopes:single",
+        ("alignment", "even rows, 40 dB"): "align_envelopes, AlignEnvelopes",
+    },
     "a moving point 26 dB above what is at rest: its side lobes are in all range cells alike": {
         ("channels", "moving point, 20 dB"): "ClutterSynchronisation"
     },
