@@ -399,11 +399,12 @@ def test_a_report_that_fails_leaves_the_results(
     assert main(arguments) == 0 and (tmp_path / "s" / "report.html").exists()
 
 
-def test_a_trial_that_ends_the_program_is_named() -> None:
+@pytest.mark.parametrize("ending", [SystemExit, GeneratorExit])
+def test_a_trial_that_ends_the_program_is_named(ending: type[BaseException]) -> None:
     def leaves(parameters: Any, draws: Any) -> Any:
-        raise SystemExit(0)
+        raise ending(0)
 
-    with pytest.raises(ConfigError, match=r"trials 0 to \d+ of .* failed: SystemExit: 0"):
+    with pytest.raises(ConfigError, match=rf"trials 0 to \d+ of .* failed: {ending.__name__}: 0"):
         run(function=leaves)
 
 

@@ -218,7 +218,7 @@ class Work:
                     continue
                 try:
                     parts.append(self._once(piece))
-                except (Exception, SystemExit) as error:
+                except (Exception, SystemExit, GeneratorExit) as error:
                     self._refuse_unless_halving_helps(piece, error)
                     found, waiting = -(-len(piece) // 2), [piece, *waiting]
         if _global_generators() != before:

@@ -232,7 +232,7 @@ class Bench:
                 raise (ValueError if trace.signal.names in system.images else ConfigError)(f"processor.{name}, {fault}")
             with gathered_checks():
                 judged = self.system.judge(self, name, replace(trace, estimates=estimates), trials, detail)
-        except SystemExit as error:
+        except (SystemExit, GeneratorExit) as error:
             raise ConfigError(f"{self.file}: processor.{name}: a stage ends the program") from error
         except ConfigError as error:
             raise ConfigError(str(error) if str(error).startswith(self.file) else f"{self.file}: {error}") from error
