@@ -46,11 +46,9 @@ CHAIN_WAITS = {
     "isal_rotation_snr": (10, ["world.pulses=1000"]),  # the last step of a fit shows that it has converged
 }
 
+# sizes of worlds of SCENES that would take seconds
 SMALL = {
-    "stripmap": {},
-    "isal": {},
     "isal_rotation": {"pulses": 400},
-    "sal": {},
     "geo": {"pulses": 512},
     "geo_ocean": {"pulses": 300, "samples": 64},
     "path": {"pulses": 48, "samples": 48},
@@ -165,7 +163,7 @@ def _spoiled(x: Tensor) -> Tensor:
 
 def small(system: str, folder: Path) -> Loaded:
     processor = {**SCENES[system]["processor"], **CHAINS.get(system, {})}
-    return loaded_as(folder, system, world=world(system, **SMALL[system]), processor=processor)
+    return loaded_as(folder, system, world=world(system, **SMALL.get(system, {})), processor=processor)
 
 
 def figures(loaded: Loaded, device: str, trials: list[int]) -> dict[str, Tensor]:
@@ -178,7 +176,7 @@ def figures(loaded: Loaded, device: str, trials: list[int]) -> dict[str, Tensor]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("system", SMALL)
+@pytest.mark.parametrize("system", SCENES)
 def test_systems(system: str, place: Place, tmp_path: Path) -> None:
     """Simulation, recommended chain, metrics and bounds, of few trials and of the same twice."""
     few = [0] if system in _ONCE else [0, 1]
@@ -203,7 +201,7 @@ def test_systems(system: str, place: Place, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("system", SMALL)
+@pytest.mark.parametrize("system", SCENES)
 def test_systems_work_where_a_device_is_the_default(system: str, place: Place, tmp_path: Path) -> None:
     loaded = small(system, tmp_path)
     with place.counted(), place.device:

@@ -20,7 +20,6 @@ from torchsar.study.table import load
 from torchsar.study.trials.bench import Bench
 
 PAGE = Path(__file__).parents[2] / "docs" / "how_to" / "world_to_metric.md"
-SYSTEMS = ("stripmap", "path", "geo", "geo_ocean", "isal", "isal_rotation", "sal")
 DRAWS = Draws(1, "run", range(4))
 SNR_DB, SHARE = (torch.tensor(x, dtype=torch.float64) for x in ([10.0, 30.0, 10.0, 30.0], [1.0, 1.0, 1.1, 1.1]))
 
@@ -143,6 +142,7 @@ CONFIGS: dict[str, tuple[dict[str, Any], dict[str, Any], dict[str, Any], str]] =
         "motion.drift.velocity_m_s",
     ),
 }
+SYSTEMS = tuple(CONFIGS)
 
 
 def blocks() -> list[str]:
