@@ -137,7 +137,8 @@ def remove_tones(x: Tensor, count: int = 4, least_excess: float = 20.0) -> Tenso
 
     Each tone is found where the spectrum over pulses and samples is highest, and subtracted with
     its amplitude of least squares. A tone whose frequency or phase changes from line to line is one
-    for `subtract_interference`. Differentiable in the samples, with the frequencies held fixed.
+    for `subtract_interference`. The echo of a target in uniform motion is such a tone as well, and
+    is subtracted. Differentiable in the samples, with the frequencies held fixed.
 
     Args:
         x: Samples, shape (..., pulse, sample), complex.
