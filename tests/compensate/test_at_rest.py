@@ -10,10 +10,12 @@ import torch
 from tests.compensate.scenes import noisy, still, turned, white
 from torchsar.compensate import DopplerCentroid, MirrorProduct, PhaseIncrement, SegmentedInterference, autofocus, sca
 from torchsar.core import Draws, Outcome, Recording, Signal
-from torchsar.echo import Leakage, apply_impairments
+from torchsar.echo import Leakage, apply_impairments, simulate_ladar
 from torchsar.echo.receiver import GroundAtRest
 from torchsar.metrics import phase_rmse
+from torchsar.radar import TriangularLadar
 from torchsar.repair import remove_constant, remove_tones
+from torchsar.scene import LadarWorld, Points, Polynomial
 from torchsar.study.bench import ladars, pulses, strips
 
 TRIALS = 6
@@ -64,6 +66,29 @@ def test_doppler(spur: tuple[float, float], remove: Callable, level_db: float) -
         found = stage(batch.data.with_data(remove(data)))
         clean, name = stage(batch.data), "doppler_baseband_hz"
         assert found.ok.all() and (found[name] - clean[name]).abs().max() < 0.5
+
+
+@pytest.mark.parametrize("spur_db", [0.0, 10.0, 30.0])
+@pytest.mark.parametrize("constant_db", [-30.0, 0.0, 10.0])
+def test_a_ladar_names_spurs_and_is_right_once_they_are_removed(spur_db: float, constant_db: float) -> None:
+    batch = ladars.own()(TRIALS, 3)
+    data = impaired(
+        batch.data.with_data(impaired(batch.data, ladars.RADAR, Leakage(constant_db))),
+        ladars.RADAR,
+        Leakage(spur_db, 0.11, 0.23),
+    )
+    for stage in (MirrorProduct(ladars.RADAR), SegmentedInterference(ladars.RADAR)):
+        assert (stage(batch.data.with_data(data)).outcome == Outcome.AT_REST).all()
+        assert stage(batch.data.with_data(remove_tones(data))).ok.all()
+
+
+@pytest.mark.parametrize("range_m", [0.0, 0.005, 0.1])
+def test_a_target_of_uniform_motion_is_no_tone_of_the_receiver(range_m: float) -> None:
+    sal = TriangularLadar(1.934e14, 5e9, 16e-6, 16e6, 60.0, 3000.0)
+    world = LadarWorld(Points([0.0], [range_m]), [Polynomial([0.2])], snr_db=10.0)
+    signal = simulate_ladar(sal, world, 96, draws=Draws(1, trials=range(TRIALS)))[0].signal
+    for stage in (MirrorProduct(sal), SegmentedInterference(sal)):
+        assert stage(signal).ok.all()
 
 
 @pytest.mark.parametrize("level_db", [-10.0, 0.0, 30.0])

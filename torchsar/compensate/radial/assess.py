@@ -16,7 +16,9 @@ from torchsar.compensate.radial.measured import LEAST_SQUARED, TINY, Intercept, 
 from torchsar.compensate.radial.phases import SAME_RAD, Walk
 from torchsar.compensate.radial.product import mirror_velocity
 from torchsar.core import Axis, Estimate, Outcome, cis, host_value, power_of, true_positions, unit_level, worst
+from torchsar.core.tone import Tone, strongest_tone
 from torchsar.metrics.phase import phase_rmse
+from torchsar.radar import TriangularLadar
 
 # least number of periods with an echo from which phases are estimated
 LEAST_PERIODS = 8
@@ -49,12 +51,12 @@ def assessed_velocity(found: Estimate, measured: Measured, pulse: Axis, sweeps: 
 
         - INEXACT where the SNR after compression is too low for peaks that exceed the noise in all
           periods, or the standard deviation exceeds 0.035 lambda / T (T is the length of a sweep);
-        - PARTS_DISAGREE where a part of the echo has another velocity (`_one_sided`), unless a
-          constant explains it;
+        - PARTS_DISAGREE where a part of the echo has another velocity (`_one_sided`), unless
+          tones of the receiver explain it;
         - AMBIGUOUS where both sweeps have more power in common at another velocity, in more than
           one period of 20;
-        - AT_REST where a constant holds more than a fifth of the energy, and the velocity is about
-          zero, as that of the constant, in more than one period of 20;
+        - AT_REST where tones of the receiver (`_tones`) hold more than a fifth of the energy, and
+          the velocity is that of the tones in more than one period of 20;
         - NOISE where they have no more in common than noise at any velocity;
         - EMPTY where all samples are zero.
     """
@@ -66,16 +68,15 @@ def assessed_velocity(found: Estimate, measured: Measured, pulse: Axis, sweeps: 
     highest = lines.amax(-1).sqrt().to(torch.float64) / m
     best = Levels.of(highest, product)
     elsewhere = mean_of((highest > 1.1 * measured.common).to(torch.float64), lit)[..., 0]
-    unit = unit_level(sweeps.detach(), 3)
-    share = power_of(unit.mean((-3, -2, -1))) / power_of(unit).mean((-3, -2, -1)).clamp_min(TINY)
-    still = mean_of((measured.raw_m_s.abs() < 0.1 * bin_m_s).to(torch.float64), lit)[..., 0]
+    share, of_receiver = _tones(sweeps.detach(), measured.raw_m_s, product.radar, pulse)
+    still = mean_of(of_receiver.to(torch.float64), lit)[..., 0]
     # A velocity with an error of 0.07 bins or more is of no use. Noise alone gives 0.05 at the
     # lowest sufficient SNR.
     useless = mean_of(square, product.lit)[..., 0] >= (0.07 * bin_m_s) ** 2
     outcome = worst(
         (Outcome.INEXACT, ~measured.enough | useless),
-        # A constant of more than half a percent of the energy causes such lines, too. Up to a fifth
-        # it does not change the velocity.
+        # Tones of more than half a percent of the energy cause such lines, too. Up to a fifth they
+        # do not change the velocity.
         (Outcome.PARTS_DISAGREE, _one_sided(lines, lit) & (share < 0.005)),
         (Outcome.AMBIGUOUS, (best.squared >= LEAST_SQUARED) & (elsewhere > 0.05)),
         (Outcome.AT_REST, (share > 0.2) & (still > 0.05)),
@@ -84,6 +85,43 @@ def assessed_velocity(found: Estimate, measured: Measured, pulse: Axis, sweeps: 
         (Outcome.EMPTY, (measured.common == 0).all(-1)),
     )
     return replace(found, std={**found.std, "velocity_m_s": square.sqrt()}, outcome=outcome)
+
+
+def _tones(sweeps: Tensor, raw_m_s: Tensor, radar: TriangularLadar, pulse: Axis) -> tuple[Tensor, Tensor]:
+    """Find a constant and two spurs that stand at one frequency in both sweeps of all periods.
+
+    The beat of a target has other frequencies in up and down sweeps, unless it lies at the
+    reference range. Its phase then continues from sample to sample and from period to period, which
+    distinguishes it from a spur.
+
+    Args:
+        sweeps: The sweeps as recorded, shape (..., 2, pulse, N), complex.
+        raw_m_s: Measured velocities, shape (..., pulse).
+        radar: Ladar parameters.
+        pulse: Slow-time axis.
+
+    Returns:
+        Share of the energy that the tones hold, shape (...,); and whether a velocity is that of the
+        product of two of them, shape (..., pulse), bool.
+    """
+    rest = unit_level(sweeps, 3)
+    energy, n, shares, cycles = power_of(rest).mean((-3, -2, -1)).clamp_min(TINY), rest.shape[-1], [], []
+    for spur in (False, True, True):
+        tone = strongest_tone(rest[..., 0, :, :], rounds=4)
+        f, g = (tone.sample_cycles * spur, tone.pulse_cycles * spur)
+        unit = Tone(torch.ones_like(tone.amplitude), f, g, tone.share, tone.excess).samples(*rest.shape[-2:])
+        steady = (rest * unit.conj()[..., None, :, :]).mean(-2)
+        both = steady[..., n - n // 2 :].mean(-1) * steady[..., : n // 2].mean(-1).conj()
+        # the beat of a target at the reference range has this frequency on the mean of both sweeps
+        f = f + both.angle().to(torch.float64).mean(-1) * (spur / (2 * math.pi * (n - n // 2)))
+        turns = f * radar.sample_rate_hz * pulse.step - g
+        share = both.real.amin(-1).clamp_min(0) / energy
+        shares.append(torch.where(((turns - torch.round(turns)).abs() > 0.03) | (not spur), share, 0))
+        cycles.append(torch.where(shares[-1] > 0.005, f, torch.nan))
+        rest = rest - steady.mean(-1)[..., None, None] * unit[..., None, :, :]
+    pairs = torch.stack([f + other for f in cycles for other in cycles], -1)[..., None, :]
+    turns = raw_m_s[..., None] * (4 / (radar.wavelength_m * radar.sample_rate_hz)) - pairs
+    return torch.stack(shares).sum(0), ((turns - torch.round(turns)).abs() < 0.2 / n).any(-1)
 
 
 def _one_sided(lines: Tensor, lit: Tensor) -> Tensor:
