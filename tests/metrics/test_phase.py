@@ -103,6 +103,11 @@ def test_one_or_two_pulses_leave_no_residual(n):
     assert float(residual_phase(white(n), white(n, seed=1)).abs().max()) < 1e-9
 
 
+def test_phases_of_different_pulses_are_refused():
+    with pytest.raises(ValueError, match=r"phase needs an estimate and .* same pulses.* \(4, 32\) and \(4, 16\)$"):
+        phase_rmse(torch.zeros(4, 32), torch.zeros(4, 16))
+
+
 def test_non_finite_phases_raise():
     with pytest.raises(ValueError, match="1 of 3 phases are NaN"):
         residual_phase(torch.tensor([0.0, torch.nan, 0.0]), torch.zeros(3))

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import is_dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -23,8 +24,9 @@ _UNIONS = (typing.Union, types.UnionType)
 def check_kinds(members: Iterable[Any]) -> dict[str, Any]:
     """Let dataclasses and functions refuse arguments of another kind than their annotations name.
 
-    A parameter is examined if its annotation names a class or a protocol of this package, or a
-    tuple of a fixed length. Where a sequence of such objects is expected, a single one is accepted.
+    A parameter is examined if its annotation names a class or a protocol of this package, `bool`,
+    or a tuple of a fixed length. Where a sequence of such objects is expected, a single one is
+    accepted.
 
     Args:
         members: Members of a package. Classes are changed in place.
@@ -67,12 +69,30 @@ def fitted(function: Callable[..., Any], owner: str, args: tuple, given: dict[st
         form = _fitted(value, kinds[name]) if name in kinds else value
         if form is _UNFIT:
             got = f"the class {value.__name__}, not an object of it" if isinstance(value, type) else argument(value)
-            hint = "; pass its signal: recording.signal" if hasattr(value, "signal") else ""
+            others = " or ".join(_others(function, name, value))
+            hint = "; pass its signal: recording.signal" if hasattr(value, "signal") else others and f"; use {others}"
             raise TypeError(f"{owner}: {name} must be {_words(kinds[name])}, got {got}{hint}")
         return form
 
     names = list(inspect.signature(function).parameters)
     return tuple(map(fit, names, args)) + args[len(names) :], {name: fit(name, value) for name, value in given.items()}
+
+
+def _others(function: Callable[..., Any], name: str, value: Any) -> Iterator[str]:
+    """Names of the functions of the same package that begin with the same word and accept a value
+    as this parameter.
+    """
+    package = _package(function)
+    for other in getattr(package, "__all__", ()):
+        if other.partition("_")[0] == function.__name__.partition("_")[0]:
+            kind = _examined(getattr(package, other)).get(name)
+            if kind is not None and _fitted(value, kind) is not _UNFIT:
+                yield other
+
+
+def _package(of: Any) -> types.ModuleType:
+    """Package of the room in which a class or a function is defined."""
+    return sys.modules[".".join(of.__module__.split(".")[:2])]
 
 
 def _examining(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -105,7 +125,7 @@ def _accepts_all(hint: Any) -> bool:
     if origin in (Sequence, tuple, list):
         numbers = {*(typing.get_args(inner[0]) or inner[:1])} <= {float, int, Tensor}
         return not numbers and (len(inner) == 1 or Ellipsis in inner) and _accepts_all(inner[0])
-    return not (isinstance(hint, type) and hint.__module__.startswith("torchsar."))
+    return hint is not bool and not (isinstance(hint, type) and hint.__module__.startswith("torchsar."))
 
 
 def _fitted(value: Any, hint: Any) -> Any:
@@ -122,7 +142,7 @@ def _fitted(value: Any, hint: Any) -> Any:
     if origin is Mapping:
         fits = isinstance(value, Mapping) and all(_fitted(part, inner[1]) is not _UNFIT for part in value.values())
     elif origin is None:
-        fits = _is_one(value, hint)
+        fits = isinstance(value, bool | np.bool_) if hint is bool else _is_one(value, hint)
     elif not hasattr(value, "__len__") or not getattr(value, "ndim", 1) or isinstance(value, str | Mapping):
         form = _UNFIT if _accepts_all(inner[0]) else _fitted(value, inner[0])
         return _UNFIT if form is _UNFIT else (form,)
@@ -159,8 +179,8 @@ def _words(hint: Any) -> str:
     origin, inner = typing.get_origin(hint), typing.get_args(hint)
     if origin in _UNIONS:
         return " or ".join(map(_words, inner))
-    if hint is types.NoneType:
-        return "None"
+    if hint in (types.NoneType, bool):
+        return "None" if hint is types.NoneType else "True or False"
     if origin is Mapping:
         return f"a mapping, such as {{'first': x}}, with x {_words(inner[1])}"
     if origin is tuple and Ellipsis not in inner:
@@ -174,8 +194,7 @@ def _words(hint: Any) -> str:
 
 def _concrete(kind: type) -> Iterator[type]:
     """A public class, or the public ones that follow a protocol or another base."""
-    package = sys.modules[".".join(kind.__module__.split(".")[:2])]
-    if kind.__name__ in getattr(package, "__all__", ()) and not _declared(kind):
+    if kind.__name__ in getattr(_package(kind), "__all__", ()) and not _declared(kind):
         yield kind
     else:
         for one in kind.__subclasses__():

@@ -9,7 +9,7 @@ import math
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -400,6 +400,12 @@ class Recording(Shown):
     signal: Signal
     radar: Any
     aux: Mapping[str, Tensor] = field(default_factory=dict)
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            hint = f"; its signal has it: recording.signal.{name}" if name in Signal.__match_args__ else ""
+            raise AttributeError(f"a Recording has no {name!r}{hint}")
 
     @classmethod
     def from_arrays(

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import refuse_non_finite, unit_phasor
+from torchsar.radar.antenna_path import broadcast
 
 
 def residual_phase(estimate_rad: Tensor, reference_rad: Tensor, present: Tensor | None = None) -> Tensor:
@@ -34,7 +35,7 @@ def residual_phase(estimate_rad: Tensor, reference_rad: Tensor, present: Tensor 
 
     Raises:
         TypeError: If the phases are no real tensors.
-        ValueError: If a phase is not finite, or there are no phases.
+        ValueError: If a phase is not finite, there are no phases, or their shapes do not fit.
     """
     _check("residual_phase", estimate_rad, reference_rad)
     difference = estimate_rad.to(torch.float64) - reference_rad.to(torch.float64)
@@ -53,7 +54,9 @@ def residual_phase(estimate_rad: Tensor, reference_rad: Tensor, present: Tensor 
 
 
 def _check(what: str, *phases: Tensor) -> None:
-    """Raise TypeError or ValueError unless phases are finite real tensors (..., pulse)."""
+    """Raise TypeError or ValueError unless phases are finite real tensors (..., pulse) that
+    broadcast.
+    """
     for phase in phases:
         if not isinstance(phase, Tensor) or not phase.is_floating_point():
             raise TypeError(
@@ -63,6 +66,12 @@ def _check(what: str, *phases: Tensor) -> None:
         if not phase.ndim or not phase.numel():
             raise ValueError(f"{what} needs phases (..., pulse) of at least one pulse, got shape {tuple(phase.shape)}")
         refuse_non_finite(phase, what, "leave out trials without an estimate", "phases")
+    shapes = [phase.shape for phase in phases]
+    if broadcast(shapes) is None:
+        raise ValueError(
+            f"{what} needs an estimate and a reference of the same pulses, (..., pulse), got the shapes "
+            f"{' and '.join(str(tuple(shape)) for shape in shapes)}"
+        )
 
 
 def _peak(z: Tensor) -> Tensor:
@@ -114,7 +123,7 @@ def phase_rmse(estimate_rad: Tensor, reference_rad: Tensor, present: Tensor | No
 
     Raises:
         TypeError: If the phases are no real tensors.
-        ValueError: If a phase is not finite, or there are no phases.
+        ValueError: If a phase is not finite, there are no phases, or their shapes do not fit.
     """
     residual = residual_phase(estimate_rad, reference_rad, present)
     count = residual.shape[-1] if present is None else present.expand(residual.shape).sum(-1).clamp_min(1)

@@ -24,6 +24,8 @@ from matplotlib.text import Text
 from matplotlib.ticker import LogFormatter, LogLocator
 from torch import Tensor
 
+from torchsar.core.show import argument
+
 # palette, by choice: colours of text and frames, and colours of curves in their order
 INK, ACCENT, SECOND, THIRD, FAINT = "#1f2933", "#0b6e99", "#d1495b", "#e09f3e", "#9aa5b1"
 COLOURS = (ACCENT, SECOND, THIRD, "#4f7942", "#6a4c93", FAINT, "#8d5524", "#1aa6a6")
@@ -202,9 +204,14 @@ def save(
         columns: Number of panels in a row.
         width_in: Width of a figure in inches, such as 3.5 for one column of a journal and 7.16 for
             two; the height follows, and text keeps its size. None for the width of the figure.
+
+    Raises:
+        TypeError: If there is no figure.
     """
     kind = "png" if not isinstance(path, str | PathLike) or str(path).endswith(".png") else None
     figures = [figure] if isinstance(figure, Figure) else figure
+    if not (isinstance(figures, Sequence) and figures and all(isinstance(one, Figure) for one in figures)):
+        raise TypeError(f"save writes a figure or a list of figures, got {argument(figure)}; draw: plot.image(signal)")
     for one in figures:
         if width_in is not None:
             one.set_size_inches(width_in, one.get_figheight() * width_in / one.get_figwidth())

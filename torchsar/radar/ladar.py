@@ -84,11 +84,6 @@ class TriangularLadar(Instrument):
             )
         if not (isinstance(self.keep_every, int) and self.keep_every >= 1):
             raise ValueError(f"radar.keep_every must be a whole number of 1 or more, got {self.keep_every}")
-        if not self.bandwidth_hz < 2 * self.carrier_hz:
-            raise ValueError(
-                f"radar.bandwidth_hz must be less than twice the carrier of {self.carrier_hz:g} Hz, "
-                f"got {self.bandwidth_hz:g} Hz"
-            )
         for name, kinds in (("detection", get_args(Detection)), ("dechirp_sign", get_args(DechirpSign))):
             if getattr(self, name) not in kinds:
                 raise ValueError(f"radar.{name} must be one of {', '.join(kinds)}, got {getattr(self, name)!r}")
