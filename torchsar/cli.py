@@ -165,8 +165,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: Command line after the name of the program; by default that of this process.
 
     Returns:
-        Exit status: 0 after success, 1 if stdout was closed, 2 if the input is invalid (a message
-        on stderr says why), 130 if the user interrupted the command.
+        Exit status: 0 after success, 1 if stdout was closed, 2 if the input is invalid, or
+        `requires` finds that `run` refuses it (a message on stderr says why), 130 if the user
+        interrupted the command.
     """
     # the shell asks for completions of a word; the program then ends
     if "_ARGCOMPLETE" in os.environ:
@@ -297,8 +298,11 @@ def _dispatch(options: argparse.Namespace, command: str) -> int:
         from torchsar.study.commands.requires import requires
         from torchsar.study.commands.trade import trade
 
-        print((requires if options.command == "requires" else trade)(loaded, out, options.device))
-        print(out)
+        asks = options.command == "requires"
+        text, refused = requires(loaded, out, options.device) if asks else (trade(loaded, out, options.device), "")
+        print(text, out, sep="\n", flush=True)
+        if refused:
+            raise ConfigError(refused)
     return 0
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -361,6 +362,17 @@ def test_a_method_may_be_shown_beyond_its_limits(
         refuse_beyond_limits(Bench(load(write(tmp_path, system, **changes))), "odd")
     refuse_beyond_limits(Bench(load(write(tmp_path, system, **changes, beyond_limits=[method]))), "odd")
     assert "warning: cases.odd: " in caplog.text
+
+
+def test_requires_ends_as_run_where_it_refuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    system, changes, method = SHOWN[1]
+    config, out = write(tmp_path, system, **changes), tmp_path / "out"
+    assert main(["requires", config, "--out", str(out)]) == 2
+    shown = capsys.readouterr()
+    assert "refuse" in shown.out and f"`torchsar run` refuses this config: processor.{method}: " in shown.err
+    assert json.loads((out / "requires.json").read_text())["all"]["refused"].startswith(f"processor.{method}: ")
+    assert main(["requires", config, f"beyond_limits=[{method}]", "--out", str(out)]) == 0
+    assert "refuses" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("system", ["isal_rotation", "sal", "geo", "geo_ocean"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import torch
 from tests.study.scenes import PATH, TILES, bench_of, loaded_as, run, world
 from torchsar.core import Axis, Draws, Estimate, Signal, centred_ifft
 from torchsar.radar import LIGHT_M_S
-from torchsar.study.commands.requires import refuse_beyond_limits
+from torchsar.study.commands.requires import needs, refuse_beyond_limits
 from torchsar.study.commands.run import _entry
 from torchsar.study.commands.sweep import SweepTrial
 from torchsar.study.montecarlo import sweep
@@ -234,6 +235,31 @@ def test_what_a_flight_requires(tmp_path: Path) -> None:
     # a sixteenth of the wavelength of 31.2 mm
     assert "0.00195 m along the line of sight leave a phase of pi / 4" in rows["the recorded path"].neglects
     assert rows["an antenna at rest during an echo"].ok
+
+
+@pytest.mark.parametrize(
+    ("velocity_m_s", "range_axis_rad", "said"),
+    [
+        ([100.0, 0.0, 0.0], 0.0, True),
+        ([100.0, 0.0, 0.0], -math.pi / 2, False),
+        ([0.0, 100.0, 0.0], 0.0, False),
+        ([0.0, 100.0, 0.0], math.pi / 2, True),
+    ],
+)
+def test_a_flight_along_the_range_axis_is_named(
+    tmp_path: Path, velocity_m_s: list[float], range_axis_rad: float, said: bool
+) -> None:
+    start_m = [-1500.0 * (v == 0) for v in velocity_m_s[:2]]
+    flight = {"nominal": {"kind": "straight_path", "start_m": [*start_m, 1500.0], "velocity_m_s": velocity_m_s}}
+    images = {"recommended": {"stages": {"image": {**TILES, "range_axis_rad": range_axis_rad}}}}
+    changed = world("path", transmitter=flight, navigation=None)
+    bench = bench_of(tmp_path, "path", world=changed, processor=images, metrics={})
+    sentence = "along the range axis of the image: widths 'in azimuth' are then those across the track"
+    assert sum(sentence in text for text in needs(bench)["warnings"]) == said
+    with warnings.catch_warnings(record=True) as caught:  # as in `run`
+        warnings.simplefilter("always")
+        refuse_beyond_limits(bench, "")
+    assert sum(sentence in str(one.message) for one in caught) == said
 
 
 def test_an_origin_with_its_latitude_and_longitude_exchanged_is_named(tmp_path: Path) -> None:

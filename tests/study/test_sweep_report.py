@@ -392,6 +392,7 @@ def test_a_record_of_a_script_draws_itself_and_has_a_table(tmp_path: Path) -> No
         record.plot("error")
     first = record.table()[0]
     assert first["rmse"] == pytest.approx(np.sqrt((record.metrics["error_m"][0, 0] ** 2).mean()))
+    assert first["rmse_low"] < first["rmse"] < first["rmse_high"] and first["bound_limit"] == pytest.approx(0.1)
     record.to_csv(tmp_path / "table.csv")
     lines = (tmp_path / "table.csv").read_text().splitlines()
     assert lines[0].startswith("metric,algorithm,snr_db,n,trials,rmse") and len(lines) == 5

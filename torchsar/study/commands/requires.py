@@ -13,6 +13,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+from torchsar.focus.requirements import Limit
 from torchsar.study.output.folder import fresh_result
 from torchsar.study.output.numbers import write_json
 from torchsar.study.settings.errors import ConfigError, one_line
@@ -24,7 +25,7 @@ log = logging.getLogger("torchsar")
 FILES = ("config.yaml", "requires.json", "requires.txt")
 
 
-def requires(loaded: Loaded, out: Path, device: str = "cpu") -> str:
+def requires(loaded: Loaded, out: Path, device: str = "cpu") -> tuple[str, str]:
     """Write the limits of methods, neglected phases and recommended choices of each case to files.
 
     Args:
@@ -33,7 +34,8 @@ def requires(loaded: Loaded, out: Path, device: str = "cpu") -> str:
         device: Device on which the Doppler centroid and the velocity of a recording are estimated.
 
     Returns:
-        The text of requires.txt.
+        The text of requires.txt, and a sentence that says why `run` refuses the config; empty if it
+        does not.
 
     Raises:
         ConfigError: If the config is invalid, or the system cannot predict losses of a recording.
@@ -45,7 +47,8 @@ def requires(loaded: Loaded, out: Path, device: str = "cpu") -> str:
         (folder / "config.yaml").write_text(loaded.text(), encoding="utf-8")
         (folder / "requires.txt").write_text(text + "\n", encoding="utf-8")
         write_json(folder / "requires.json", trees)
-    return text
+    refused = next((f"{_where(name)}{tree['refused']}" for name, tree in trees.items() if tree["refused"]), "")
+    return text, refused and f"`torchsar run` refuses this config: {refused}"
 
 
 def needs(bench: Bench) -> dict[str, Any]:
@@ -76,6 +79,7 @@ def needs(bench: Bench) -> dict[str, Any]:
         "limits": [{**asdict(one), "verdict": one.verdict, "methods": list(names)} for one, names in limits.items()],
         "requirements": [{**asdict(row), "ok": row.ok, "verdict": row.verdict} for row in rows],
         "choices": [_choice(choice, tolerance) for choice in choices],
+        "refused": _refusal(bench, limits),
         "warnings": [one_line(w.message) for w in caught if isinstance(w.message, Warning)],
     }
 
@@ -101,20 +105,34 @@ def refuse_beyond_limits(bench: Bench, case: str) -> None:
         ConfigError: If a limit excludes a method that the config does not name in beyond_limits;
             the message has the limit, its value and a remedy.
     """
-    where = "" if case == ALL else f"cases.{case}: "
+    where = _where(case)
     try:
         limits = bench.system.limits(bench)
     except ValueError as error:
         raise ConfigError(f"{bench.file}: {where}{one_line(error)}") from None
-    for limit, methods in limits.items():
-        shown = (*bench.config.beyond_limits, *(n for n, m in bench.config.processor.items() if m.input == "clean"))
-        stopped = [name for name in methods if name not in shown]
-        if limit.verdict == "refuse" and stopped:
-            raise ConfigError(
-                f"{bench.file}: {where}processor.{stopped[0]}: {limit.sentence} (or name the method in beyond_limits)"
-            )
+    if refused := _refusal(bench, limits):
+        raise ConfigError(f"{bench.file}: {where}{refused}")
+    for limit in limits:
         if limit.verdict != "ok":
             log.warning("warning: %s%s", where, limit.sentence)
+
+
+def _where(case: str) -> str:
+    return "" if case == ALL else f"cases.{case}: "
+
+
+def _refusal(bench: Bench, limits: Mapping[Limit, Sequence[str]]) -> str:
+    """The first limit that excludes a method which the config does not name in beyond_limits, in a
+    sentence; empty if there is none.
+    """
+    shown = (*bench.config.beyond_limits, *(n for n, m in bench.config.processor.items() if m.input == "clean"))
+    stopped = ((limit, n) for limit, names in limits.items() if limit.verdict == "refuse" for n in names)
+    found = (
+        f"processor.{n}: {limit.sentence} (or name the method in beyond_limits)"
+        for limit, n in stopped
+        if n not in shown
+    )
+    return next(found, "")
 
 
 def _text(name: str, tree: Mapping[str, Any]) -> str:

@@ -217,13 +217,21 @@ class Record(show.Shown):
     def table(self) -> list[dict[str, Any]]:
         """Return the statistics of each metric, algorithm and point: rows of values by column.
 
-        Columns such as `outcome_ok` count the trials of each outcome that the record has.
+        `rmse_low` and `rmse_high` are the ends of the 95 % interval of the RMSE. Columns such as
+        `bound_cramer_rao` hold the rms of each bound of the record, NaN for metrics without it, and
+        such as `outcome_ok` count the trials of each outcome that the record has.
         """
-        points = summary_of(self, {}).tree({"title": "", **self.about}, {})["points"]
+        tree = summary_of(self, {}).tree({"title": "", **self.about}, {})
+        points, bounds = tree["points"], {}
+        for b in tree["bounds"]:
+            column = bound_name(b["metric"], b["bound"]).removeprefix(f"{b['metric']}_")
+            bounds.setdefault(column, {})[(b["metric"], *b["parameters"].values())] = b["rms"]
         columns = ("n", "trials", "rmse", "median", "mean", "std", "ok_share")
         codes = sorted({name for p in points for name in p["outcomes"]}, key=lambda name: Outcome[name])
         return [
             {"metric": p["metric"], "algorithm": p["algorithm"], **p["parameters"], **{c: p[c] for c in columns}}
+            | dict(zip(("rmse_low", "rmse_high"), p["interval"]))
+            | {c: found.get((p["metric"], *p["parameters"].values()), np.nan) for c, found in bounds.items()}
             | {f"outcome_{name.lower()}": p["outcomes"].get(name, 0) for name in codes}
             for p in points
         ]

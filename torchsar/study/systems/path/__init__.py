@@ -56,7 +56,7 @@ from torchsar.study.names.registry import (
 )
 from torchsar.study.systems.isal import estimated_phase, received
 from torchsar.study.systems.path.figures import geometry, images, paths
-from torchsar.study.systems.path.requirements import flight_requirements
+from torchsar.study.systems.path.requirements import flight_requirements, warn_of_range_along_track
 from torchsar.study.trials.batch import IMAGE, Batch, Found, Judged, Metrics, Processed, Trials
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Alternative, Choice, Measured, lit_noise, some_pixels, white_noise
@@ -414,6 +414,7 @@ class AnyPath(System):
             else (AntennaPath.recorded(bench.recording.aux), bench.recording.aux["frequency_hz"])
         )
         images = {name: last_image(chain.stages.values()) for name, chain in bench.chains.items()}
+        warn_of_range_along_track(geometry[0], [one.grid for one in images.values() if one])
         lit = None if bench.recording is not None else bench.world().beam
         antenna = (None, None)
         if lit is not None:

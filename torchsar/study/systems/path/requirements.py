@@ -3,13 +3,40 @@
 from __future__ import annotations
 
 import math
+import warnings
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
+from torchsar.focus.image_grid import ImageGrid
 from torchsar.focus.requirements import Requirement
 from torchsar.radar import LIGHT_M_S, AntennaPath, InverseRadar
 from torchsar.scene import SideBeam
+
+
+def warn_of_range_along_track(path: AntennaPath, images: Sequence[ImageGrid]) -> None:
+    """Warn once if a flight goes along the range axis of an image rather than its azimuth axis.
+
+    A flight that ends near its start, such as a circle, has no direction.
+
+    Args:
+        path: Path; of several trials the first is examined.
+        images: Grids of the images.
+    """
+    places = path.of_trial((0,) * len(path.trials)).places
+    flown = sum(place[-1] - place[0] for place in places).cpu()  # pyright: ignore[reportAttributeAccessIssue]
+    length = sum(float(place.diff(dim=0).norm(dim=-1).sum()) for place in places)
+    parts = [(grid.axes.cpu() @ flown).abs().tolist() for grid in images]
+    if any(across > max(along, length / 2) for along, across in parts):
+        heading = torch.atan2(flown[1], flown[0])
+        warnings.warn(
+            f"the flight goes {heading.rad2deg():.0f} degrees from axis x towards y, along the range axis of the "
+            "image: widths 'in azimuth' are then those across the track; "
+            f"range_axis_rad={heading - math.pi / 2:.4g} of the stage turns the image, while the scene keeps azimuth y "
+            "and range x, as do errors of navigation",
+            stacklevel=2,
+        )
 
 
 def flight_requirements(
