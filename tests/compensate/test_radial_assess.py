@@ -6,10 +6,19 @@ import pytest
 import torch
 
 from tests.compensate.radials import ESTIMATORS, GATE, seen, velocity_rms
-from torchsar.compensate import MirrorProduct, RadialMotion, phase_polish, pulse_gain, radial_motion
+from torchsar.compensate import (
+    MirrorProduct,
+    RadialMotion,
+    SegmentedInterference,
+    phase_polish,
+    pulse_gain,
+    radial_motion,
+)
 from torchsar.compensate.radial import assess, blocks, recommended
-from torchsar.core import Outcome, Signal
-from torchsar.scene import LetterE, LinearInSweep, Points, Polynomial, Sinusoid
+from torchsar.core import Draws, Outcome, Signal
+from torchsar.echo import simulate_ladar
+from torchsar.radar import TriangularLadar
+from torchsar.scene import LadarWorld, LetterE, LinearInSweep, Points, Polynomial, Sinusoid
 from torchsar.study.bench.direct.triangles import table1
 
 RADAR = table1()
@@ -98,3 +107,14 @@ def test_stages_have_the_switch() -> None:
     signal = Signal(sweeps, RADAR.sweep_axes(pulse.n))
     for stage in (MirrorProduct(RADAR, GATE, assess=False), RadialMotion(RADAR, GATE, assess=False)):
         assert bool((stage(signal).outcome == Outcome.NOT_ASSESSED).all())
+
+
+@pytest.mark.parametrize(("range_m", "rate_hz", "periods"), [(0.1, 16e6, 128), (0.013, 4e6, 48), (0.1, 4e6, 48)])
+def test_side_lobes_of_a_single_strong_point_are_no_part_of_another_velocity(
+    range_m: float, rate_hz: float, periods: int
+) -> None:
+    sal = TriangularLadar(1.934e14, 5e9, 16e-6, rate_hz, 60.0, 3000.0)
+    world = LadarWorld(Points([0.0], [range_m]), [Polynomial([0.4, 10.0])], snr_db=30.0)
+    signal = simulate_ladar(sal, world, periods, draws=Draws(1, trials=range(8)))[0].signal
+    for stage in (MirrorProduct(sal), SegmentedInterference(sal)):
+        assert stage(signal).ok.all()

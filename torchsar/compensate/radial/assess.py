@@ -146,8 +146,11 @@ def _one_sided(lines: Tensor, lit: Tensor) -> Tensor:
     excess = sides - sides.flip(-2)
     # In noise the excess has the standard deviation sqrt(square), so that 4.5 times as much occurs
     # once in a thousand records of 256 lines. 1e-5 of the main line is the limit of filters.
-    seen = (excess > 4.5 * square.sqrt()[..., None, :]) & (sides > 2.5 * other)
-    return (seen & (excess > 1e-5 * main[..., None, :])).any(-1).any(-1)
+    seen = (excess > 4.5 * square.sqrt()[..., None, :]) & (excess > 1e-5 * main[..., None, :])
+    # Beats have two neighbouring lines or more. A single line may be a zero between side lobes that
+    # are not quite symmetric, unless it is five times as strong as the other side, by trial.
+    broad = seen & (sides > 2.5 * other)
+    return ((broad[..., 1:] & broad[..., :-1]).any(-1) | (seen & (sides > 5 * other)).any(-1)).any(-1)
 
 
 def _variance(measured: Measured, pulse: Axis) -> Tensor:
