@@ -71,7 +71,9 @@ def mirror_product(
         velocity is that of the centre of power of the echo: a centre at another azimuth than
         `azimuth_m` adds a nearly constant velocity, which displaces the image and is not part of
         the standard deviation. Where many scatterers have equal phases, the error may be four times
-        the standard deviation.
+        the standard deviation. The edges of a narrow window change the power of the two sweeps in
+        opposite ways when the velocity changes; at high SNR the standard deviation counts this as
+        error and may be many times too large, less so with a small `taper`.
         `assess=True` adds the standard deviation and the outcome, see `assessed_velocity`:
         `Outcome.INEXACT` where the SNR is too low or the standard deviation exceeds
         0.035 lambda / T (T is the length of a sweep), `PARTS_DISAGREE` where a part of the echo has
