@@ -350,6 +350,19 @@ def test_the_deviation_of_an_increment_includes_apertures_cut_at_one_end(dwell_s
         assert float((error - found.info["cut_hz"]).square().mean().sqrt()) < 0.4 * float(rms)
 
 
+def test_apertures_cut_by_lost_lines_count_as_those_cut_by_the_ends() -> None:
+    """If lost lines counted as an end, what it cuts would not balance the other end."""
+    signal, _ = aircraft(RandomPoints(40, 230.0, 150.0))
+    ends = (slice(200, None), slice(None, -200))
+    lost = torch.zeros_like(signal.data)
+    for trials, kept in zip((slice(8), slice(8, None)), ends, strict=True):
+        lost[trials, kept] = signal.data[trials, kept]
+    found = PhaseIncrement(AIRCRAFT)(signal.with_data(lost))
+    cut_hz = [PhaseIncrement(AIRCRAFT)(signal.isel(pulse=kept)).info["cut_hz"] for kept in ends]
+    cut_hz = torch.cat([cut_hz[0][:8], cut_hz[1][8:]])
+    assert float((found.info["cut_hz"] - cut_hz).norm()) < 0.4 * float(cut_hz.norm())
+
+
 def test_the_increment_of_one_whole_target_is_reliable() -> None:
     signal, doppler = aircraft(Points([0.0], [0.0], random_phase=True))
     found = PhaseIncrement(AIRCRAFT)(signal)

@@ -37,8 +37,9 @@ class Increments(NamedTuple):
         power: Mean power of the same pairs of lines, shape (..., a, b).
         half_band_rad: Half of the band that a target sweeps in the beam, as a phase increment in
             rad, shape (...,).
-        ends: What the mean product of a pair of lines at the first and at the last line adds to the
-            sum of the phase increments, shape (..., 2, b), complex128, see below.
+        ends: What the mean product of a pair of lines at the first and at the last held line (one
+            that is not zero) adds to the sum of the phase increments, shape (..., 2, b),
+            complex128, see below.
         tone: What the strongest tone adds to the sum of all products, shape (...,), complex128; 0
             where no tone stands out.
         coherent: True where the products of adjacent lines, or the changes of these products, add
@@ -94,7 +95,11 @@ class Increments(NamedTuple):
         half_band = half_band.clamp(1e-3, 0.95 * math.pi)
         dwell = pairs / 2 if rate_hz_s is None else half_band * prf_hz**2 / (math.pi * rate_hz_s)
         last = max(1, pairs // (2 * products.shape[-2]))  # half of the lines of a block
-        parts = (-1, x[..., : last + 1, :]), (1, x[..., -last - 1 :, :])
+        held = (x != 0).any(-1).int()
+        first, end = held.argmax(-1).clamp_max(pairs - last), held.flip(-1).argmax(-1).clamp_max(pairs - last)
+        number = torch.arange(last + 1, device=x.device)[:, None]
+        starts = (-1, first), (1, pairs - last - end)
+        parts = [(sign, x.take_along_dim(at[..., None, None] + number, -2)) for sign, at in starts]
         mean = [sign * (part[..., :-1, :].conj() * part[..., 1:, :]).sum(-2) / last for sign, part in parts]
         ends = torch.stack(mean, -2).to(torch.complex128).tensor_split(products.shape[-1], -1)
         # number of lines that the ends affect; about half_band * dwell / 6 for a narrow band
