@@ -202,7 +202,7 @@ def test_grating_lobes_lie_where_the_warning_says():
         stage = SpotlightImage(aux, 40.0, 4.0, 0.2, centre_m=(0.0, 0.0))
     assert said[0].filename == __file__ and "201 x 21 pixels of 0.2 m" in repr(stage)
     (limit,) = stage.pulse_limits(antennas(aux), WIDE_HZ)
-    lobe_m = float(limit.consequence.split(" lie ")[1].split(" m ")[0])
+    lobe_m = float(limit.consequence.split(" lie about ")[1].split(" m ")[0])
     level = stage(signal).data.abs().amax(-1)
     away = stage.axes[0].values().abs()
     lobe = torch.where(away > lobe_m / 2, level, 0)
@@ -213,3 +213,25 @@ def test_grating_lobes_lie_where_the_warning_says():
         warnings.simplefilter("error")
         small = SpotlightImage(aux, 0.98 * lobe_m, 4.0, 0.2, centre_m=(0.0, 0.0))
     assert small.pulse_limits(antennas(aux), WIDE_HZ)[0].ok
+
+
+FLOWN = rail([-1000.0, -32, 500], [-1000.0, 31, 500], 64)
+NEAR = rail([-5.0, -1.6, 0], [-5.0, 1.55, 0], 64)
+
+
+@pytest.mark.parametrize(
+    ("path", "sides", "turn"), [(FLOWN, (50.0, 20.0), 0.0), (FLOWN, (20.0, 50.0), math.pi / 2), (NEAR, (4.0, 2.0), 0.0)]
+)
+def test_an_image_as_wide_as_the_warning_advises_has_no_grating_lobes(path, sides, turn):
+    """Along either axis, near the path, and in the trial whose pulses are the farthest apart."""
+    still = path.mean(0, keepdim=True)
+    paths = torch.stack([path, path.flip(0), still + 0.1 * (path - still)])
+    trials = AntennaPath(paths, None, paths.new_zeros(3, len(path)))
+    (limit,) = TileImage(*sides, 0.02 * min(sides), range_axis_rad=turn).pulse_limits(trials, WIDE_HZ)
+    (alone,) = TileImage(*sides, 0.02 * min(sides), range_axis_rad=turn).pulse_limits(
+        AntennaPath(path, None, paths.new_zeros(len(path))), WIDE_HZ
+    )
+    assert not limit.ok and limit.value == pytest.approx(alone.value)
+    advised = 0.99 * float(limit.remedy.split(" about ")[1].split(" m ")[0])
+    narrow = [min(side, advised) if side == max(sides) else side for side in sides]
+    assert TileImage(*narrow, 0.02 * min(narrow), range_axis_rad=turn).pulse_limits(trials, WIDE_HZ)[0].ok

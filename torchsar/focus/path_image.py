@@ -212,10 +212,13 @@ class PathImage(Stage):
         the echo from those pulses whose beam contains both. The range window lowers it, because the
         range of a ghost changes by a wavelength per pulse.
 
-        Without a beam, the paths over both sides of the image must change by less than a wavelength
+        Without a beam, the paths over both ends of the image must change by less than a wavelength
         relative to each other from pulse to pulse: grating lobes of a point lie where they change
-        by a whole one. The limit holds for the range line where the change is largest, and for the
-        median of the pulses, so that lost pulses do not matter.
+        by a whole one. The ends are those of the side across the line of sight, on the line where
+        the change is largest. The limit holds for the median of the pulses, so that lost pulses do
+        not matter, and for the trial with the largest one. The distance of the lobes follows from
+        the largest change of the spatial frequency in the image; where it is smaller, they lie
+        farther away.
 
         Args:
             antennas: Path of the antennas; the receiver has the beam.
@@ -266,23 +269,31 @@ class PathImage(Stage):
 
     def _grating_limit(self, antennas: AntennaPath, frequency_hz: Tensor) -> Limit:
         """Return the limit of the pulses without a beam, see `pulse_limits`."""
-        places = [place.detach().reshape(-1, antennas.pulses, 3).mean(0) for place in antennas.places]
-        points = self._nine_points().to(places[0].device)
+        places = [place.detach() for place in antennas.places]
+        points, wavelength = self._nine_points().to(places[0].device), LIGHT_M_S / float(frequency_hz.max())
         path_m = AntennaPath(places[0], places[-1], places[0].new_zeros(antennas.pulses)).path_m(points)
-        steps = path_m.diff(dim=0).unflatten(-1, (_POINTS, _POINTS))
-        turns = (steps.amax(-2) - steps.amin(-2)).amax(-1) * float(frequency_hz.max()) / LIGHT_M_S
-        apart = float(turns[turns > 0].median().nan_to_num(0.0))
-        lobe_m = self.grid.step_m * (self.grid.counts[0] - 1) / max(apart, 1e-12)
+        steps = path_m.diff(dim=-2).unflatten(-1, (_POINTS, _POINTS))
+        sides = torch.stack([(steps.amax(side) - steps.amin(side)).amax(-1) for side in (-2, -1)], -1)
+        away = [torch.nn.functional.normalize(points - x[..., None, :], dim=-1) for x in (places[0], places[-1])]
+        # of the path along both axes, (..., pulse, point, axis)
+        slopes = (away[0] + away[1]) @ self.grid.axes.to(points).mT
+        # the pulses resolve the side that lies across the line of sight
+        across = slopes.mean(-2)[..., 1:, :].abs().argmin(-1, keepdim=True)
+        both = [x.gather(-1, across)[..., 0] / wavelength for x in (sides, slopes.diff(dim=-3).abs().amax(-2))]
+        # one more NaN, since a single pulse has no step
+        moving = [torch.nn.functional.pad(x.masked_fill(both[0] <= 0, math.nan), (0, 1), value=math.nan) for x in both]
+        apart, rate = (float(x.nanmedian(-1).values.nan_to_num(0.0).max()) for x in moving)
+        lobe_m = 1 / max(rate, 1e-12)
         return Limit(
             "the change of path from pulse to pulse across the image",
             apart,
             1.0,
             "wavelengths",
             "warn",
-            f"the pulses do not tell apart places that lie {lobe_m:.3g} m from each other in azimuth, where bright "
-            "points have grating lobes",
-            f"choose an azimuth extent of at most {lobe_m:.3g} m if the beam illuminates no more, or raise the PRF by "
-            f"a factor of {apart:.3g}",
+            f"the pulses do not tell apart places that lie about {lobe_m:.3g} m or more from each other across the "
+            "line of sight, where bright points have grating lobes",
+            f"choose an extent across the line of sight of about {lobe_m:.3g} m if the beam illuminates no more, or "
+            f"raise the PRF by a factor of {apart:.3g}",
         )
 
     def _nine_points(self) -> Tensor:
