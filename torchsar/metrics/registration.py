@@ -76,8 +76,10 @@ def registered_errors(image: Tensor | Signal, reference: Tensor | Signal) -> dic
 
     An image whose amplitudes are right serves for all that is seen; the phases matter where images
     are compared or added, as in interferometry. Autofocus leaves slow phases over the image, which
-    make the error of the complex samples large although the image is sharp. Registration, arguments
-    and raised errors are those of `registered_error_db`.
+    make the error of the complex samples large although the image is sharp. The registration
+    is that which minimises the error of the complex samples, see `registered_error_db`, with its
+    arguments and raised errors. Strong phases displace it, and with it the amplitudes: at equal amplitudes, a
+    sine phase of 2.5 rad leaves -25 to -34 dB.
 
     Args:
         image: Image I, shape (..., azimuth, range), complex, or a Signal.
@@ -90,7 +92,8 @@ def registered_errors(image: Tensor | Signal, reference: Tensor | Signal) -> dic
         phases, weighted by the product of the moduli; and `image_error_db`, the error of the
         complex samples, see `registered_error_db`. Images that have nothing in common have 0 dB and
         1.81 rad, as unrelated phases, but for the amplitudes of unrelated speckle: two positive
-        moduli fit each other by chance, to 1 - (pi / 4)^2, which is -4.2 dB.
+        moduli fit each other by chance, to about 1 - (pi / 4)^2, which is -4.2 dB (-4.3 to -4.7 dB
+        after registration, or 0 dB where it leaves little overlap).
     """
     axes = [[(axis.name, axis.step) for axis in x.axes[-2:]] for x in (image, reference) if isinstance(x, Signal)]
     if len(axes) == 2 and axes[0] != axes[1]:
