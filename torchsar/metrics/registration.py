@@ -78,8 +78,8 @@ def registered_errors(image: Tensor | Signal, reference: Tensor | Signal) -> dic
     are compared or added, as in interferometry. Autofocus leaves slow phases over the image, which
     make the error of the complex samples large although the image is sharp. The registration
     is that which minimises the error of the complex samples, see `registered_error_db`, with its
-    arguments and raised errors. Strong phases displace it, and with it the amplitudes: at equal amplitudes, a
-    sine phase of 2.5 rad leaves -25 to -34 dB.
+    arguments and raised errors. Strong phases displace it, and with it the amplitudes: at
+    equal amplitudes, a sine phase of 2.5 rad leaves -25 to -34 dB.
 
     Args:
         image: Image I, shape (..., azimuth, range), complex, or a Signal.
