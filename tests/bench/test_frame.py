@@ -120,8 +120,15 @@ def test_a_wrong_shape_is_one_sentence() -> None:
 
 
 def test_values_that_are_not_finite_are_no_results() -> None:
-    rows = few(lambda x: torch.full(x.shape[:-1], torch.nan))
+    """A method may find nothing, but it cannot be sure of it."""
+    nothing = lambda x: torch.full(x.shape[:-1], torch.nan)  # noqa: E731
+    rows = few(lambda x: (nothing(x), None, torch.zeros(len(x), dtype=torch.bool)))
     assert rows["all"]["ok"][0] == 0 and rows["all"]["merit"][0] == 0
+    for sure in (nothing, lambda x: (nothing(x), None, torch.ones(len(x), dtype=torch.bool))):
+        with pytest.raises(entrant.MethodError, match="6 of 6 trials are sure of values that are NaN or Inf"):
+            few(sure)
+    with pytest.raises(entrant.MethodError, match="standard deviations of at least 0, got -1"):
+        few(lambda x: (torch.zeros(x.shape[:-1]), -torch.ones(x.shape[:-1])))
 
 
 def test_a_method_cannot_change_the_data() -> None:

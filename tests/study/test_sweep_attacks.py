@@ -408,6 +408,14 @@ def test_a_trial_that_ends_the_program_is_named(ending: type[BaseException]) -> 
         run(function=leaves)
 
 
+def test_a_metric_without_its_trials_is_refused() -> None:
+    def averages(parameters: Any, draws: Any) -> Any:
+        return {"error_m": draws.normal("x", (3,)).mean()}
+
+    with pytest.raises(ConfigError, match=r"each of the 2 trials, got torch.float64 of shape \(\); reduce over the last"):
+        sweep(averages, {"a": [1.0]}, trials=2, chunk=2)
+
+
 def test_an_error_names_the_line_of_the_function(tmp_path: Path) -> None:
     def fails(parameters: Any, draws: Any) -> Any:
         x = draws.normal("x", (3,))

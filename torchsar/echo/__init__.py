@@ -16,8 +16,8 @@ lost or misnumbered lines         `LostLines`, `LostGaps`, `LostPulses`, `Repeat
 interference, converter           `Tone`, `WideInterferer`, `Quantiser`, `PeriodicJitter`
 pulses of another radar           `PulsedInterference`
 constant, drift, spur             `Leakage`
-I and Q, gain, range gate         `QuadratureError`, `receiver.GainSteps`, `receiver.GateJumps`
-echo that does not move along     `receiver.GroundAtRest`
+I and Q, gain, range gate         `QuadratureError`, `GainSteps`, `GateJumps`
+echo that does not move along     `GroundAtRest`
 receiver of one channel           `ChannelResponse`, made by `smooth_response`
 receiver of several channels      `ChannelImbalance` for lines in turn, `ChannelErrors` for channels
                                   along track
@@ -46,7 +46,7 @@ from torchsar.echo.ladar_record import simulate_ladar_record
 from torchsar.echo.lines import CorruptedNumbers, LostGaps, LostLines, LostPulses, RepeatedLines
 from torchsar.echo.path import PathError, path_echo, simulate_path
 from torchsar.echo.pulse_phase import PhaseSinusoid, PhaseWalk, WhitePhase
-from torchsar.echo.receiver import Leakage, PulsedInterference, QuadratureError
+from torchsar.echo.receiver import GainSteps, GateJumps, GroundAtRest, Leakage, PulsedInterference, QuadratureError
 from torchsar.echo.recorded import Impairment, apply_impairments
 from torchsar.echo.response import ChannelResponse, smooth_response
 from torchsar.echo.strip import simulate, stripmap_echo
@@ -58,6 +58,9 @@ __all__ = [
     "ChannelImbalance",
     "ChannelResponse",
     "CorruptedNumbers",
+    "GainSteps",
+    "GateJumps",
+    "GroundAtRest",
     "Impair",
     "Impairment",
     "Leakage",

@@ -122,7 +122,7 @@ class GroundAtRest:
     >>> from torchsar import Draws, echo, radar, scene
     >>> isar = radar.InverseRadar(1e10, 1e9, 500.0, rotation_rad_s=0.1)
     >>> world = scene.TurntableWorld(scene.Points([0.0], [0.0]))
-    >>> errors = {"ground": echo.receiver.GroundAtRest(over_signal_db=0.0)}
+    >>> errors = {"ground": echo.GroundAtRest(over_signal_db=0.0)}
     >>> _, truth = echo.simulate_turntable(isar, world, 64, 8, Draws(1), errors)
     >>> truth.values["ground.band_cycles"]
     tensor(0.0200, dtype=torch.float64)
@@ -269,7 +269,7 @@ class GainSteps:
     >>> from torchsar import Draws, echo, radar, scene
     >>> isar = radar.InverseRadar(1e10, 1e9, 500.0, rotation_rad_s=0.1)
     >>> world = scene.TurntableWorld(scene.Points([0.0], [0.0]))
-    >>> errors = {"gain": echo.receiver.GainSteps(count=1, step_db=6.0)}
+    >>> errors = {"gain": echo.GainSteps(count=1, step_db=6.0)}
     >>> _, truth = echo.simulate_turntable(isar, world, 8, 8, Draws(1), errors)
     >>> len(truth.values["gain.gain_db"].unique())
     2
@@ -312,7 +312,7 @@ class GateJumps:
     >>> from torchsar import Draws, echo, radar, scene
     >>> isar = radar.InverseRadar(1e10, 1e9, 500.0, rotation_rad_s=0.1)
     >>> world = scene.TurntableWorld(scene.Points([0.0], [0.0]))
-    >>> errors = {"gate": echo.receiver.GateJumps(cells=2)}
+    >>> errors = {"gate": echo.GateJumps(cells=2)}
     >>> recording, truth = echo.simulate_turntable(isar, world, 4, 16, Draws(1), errors)
     >>> recording.signal.data.abs().argmax(-1) - 8 == truth.values["gate.shift_cells"]
     tensor([True, True, True, True])

@@ -145,7 +145,12 @@ def _estimate(out: Any, name: str, x: Tensor, per_pulse: bool) -> Estimate:
             raise MethodError(f"{told}; the order is (value, std, ok), and std may be None")
     value = value.double()
     finite = torch.isfinite(value).reshape(len(value), -1).all(-1)
-    good = finite if ok is None else finite & ok.bool()
+    good = torch.ones(len(value), dtype=torch.bool) if ok is None else ok.bool().expand(len(value))
+    if not finite[good].all():
+        told = f"{int((good & ~finite).sum())} of {len(value)} trials are sure of values that are NaN or Inf"
+        raise MethodError(f"a method must return finite {name}, but {told}; return ok, False where it found nothing")
+    if std is not None and (std < 0).any():
+        raise MethodError(f"a method must return standard deviations of at least 0, got {float(std.min()):.3g}")
     code = Outcome.of(good, Outcome.UNSPECIFIED)
     code = torch.where(good, int(Outcome.NOT_ASSESSED), code) if ok is None else code
     table = {} if std is None else {name: std.double().expand(value.shape)}

@@ -11,13 +11,15 @@ from torch import Tensor
 
 from torchsar.core import Draws, Estimate, Signal, unit_phasor
 from torchsar.echo import (
+    GainSteps,
+    GateJumps,
+    GroundAtRest,
     Impairment,
     Leakage,
     QuadratureError,
     Quantiser,
     simulate_turntable,
 )
-from torchsar.echo.receiver import GainSteps, GateJumps, GroundAtRest
 from torchsar.focus import compress_dechirped
 from torchsar.metrics import entropy, phase_rmse, residual_phase
 from torchsar.radar import InverseRadar

@@ -355,8 +355,11 @@ def _rows(value: Any, rows: int, what: str) -> list[float]:
         x = value if isinstance(value, Tensor) else torch.as_tensor(value)
     except (TypeError, RuntimeError, ValueError):
         raise ValueError(f"{expected} {type(value).__name__}") from None
-    if x.is_complex() or x.shape not in ((rows,), ()):
-        raise ValueError(f"{expected} {x.dtype} of shape {tuple(x.shape)}")
+    # a bound may be one number for all trials, but a metric that is one lacks its trials
+    shared = rows == 1 or what.startswith(f"{BOUNDS}.")
+    if x.is_complex() or x.shape not in ((rows,), *[()] * shared):
+        tip = "; reduce over the last dimensions only, as in x.mean(-1)" if x.ndim == 0 else ""
+        raise ValueError(f"{expected} {x.dtype} of shape {tuple(x.shape)}{tip}")
     if what.endswith(f".{OK}") and x.dtype != torch.bool:
         raise ValueError(f"{what} must be bool, got {x.dtype}")
     if what.endswith(f".{OUTCOME}") and not set(x.reshape(-1).tolist()) <= set(Outcome):

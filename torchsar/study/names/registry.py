@@ -21,7 +21,6 @@ from torchsar import compensate, echo, focus, metrics, multichannel, repair, sce
 from torchsar.compensate import Autofocus, EffectiveVelocity, RotationAutofocus, UnevenRotation
 from torchsar.compensate.pulse_phase import CorrectPulsePhase
 from torchsar.core import Alternate, Stage, Turn
-from torchsar.echo.receiver import GainSteps, GateJumps, GroundAtRest
 from torchsar.focus import OmegaK, PaddedLines, TargetImage
 from torchsar.metrics import Measure
 from torchsar.multichannel import (
@@ -413,7 +412,7 @@ CALIBRATIONS = Catalogue("calibration", "kind", (scene.CalibrationFibre,))
 GATES = Catalogue("gate", "kind", (scene.BandLimited, scene.Pattern))
 SEAS = Catalogue("sea", "kind", (k_sea, image_sea))
 RECEIVE_RANGES = Catalogue("receive range", "kind", (scene.ExactRange, scene.TaylorRange))
-_OF_RECEIVERS = (echo.Leakage, echo.QuadratureError, GainSteps)
+_OF_RECEIVERS = (echo.Leakage, echo.QuadratureError, echo.GainSteps)
 MULTICHANNEL_IMPAIRMENTS = Catalogue(
     "impairment of a multichannel recording",
     "kind",
@@ -425,8 +424,8 @@ _OF_TARGETS = (
     echo.PhaseWalk,
     echo.PhaseSinusoid,
     echo.Quantiser,
-    GateJumps,
-    GroundAtRest,
+    echo.GateJumps,
+    echo.GroundAtRest,
     *_OF_RECEIVERS,
 )
 IMPAIRMENTS = Catalogue(
