@@ -25,7 +25,7 @@ from torchsar.focus import CompressDechirped, azimuth_transform
 from torchsar.metrics import entropy
 from torchsar.radar import LIGHT_M_S, InverseRadar
 from torchsar.scene import Aircraft, Dechirped, Polynomial, Sinusoid, TurntableWorld, UniformStartPhase
-from torchsar.study.bench.profiles import aligned
+from torchsar.study.bench.profiles import aligned, noisy, turned, white
 
 DOUBLE = torch.complex128
 LADAR = InverseRadar(LIGHT_M_S / 1.55e-6, 150e9, 2000.0, 0.005, 100e-6, 20e3)
@@ -409,3 +409,18 @@ def test_jumps_are_found_at_low_snr_or_doubted(cells: float, share: float, lasti
         error = rms(off(found["shift_cells"], batch.truth["shift_cells"] + truth["shift_cells"], 128))
         assert not (found.ok & (error > 0.05)).any()
         assert snr_db < 0 or (found.ok.all() and clean.ok.all())
+
+
+def test_a_gate_that_follows_the_target_is_found() -> None:
+    """Without its jumps no pulse is a whole cell from the course of the others."""
+    t = torch.linspace(-1, 1, 96, dtype=torch.float64)
+    smooth = 3 * t + 2 * t**2
+    course = (smooth - smooth.round()).expand(4, 96)
+    at = torch.tensor([15.0, 21.0, 23.0], dtype=torch.float64) + course[..., None]
+    frequency = torch.fft.fftfreq(48, dtype=torch.float64)
+    spectrum = (torch.tensor([1.0, 0.7, 0.5]) * torch.exp(-2j * math.pi * frequency[:, None] * at[..., None, :])).sum(
+        -1
+    )
+    x = turned(torch.fft.ifft(spectrum), white(4, 96, 1))
+    found = align_envelopes(noisy(x, 10.0, 2))
+    assert found.ok.all() and rms(off(found["shift_cells"], course, 48)).max() < 0.02

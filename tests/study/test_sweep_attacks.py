@@ -412,7 +412,9 @@ def test_a_metric_without_its_trials_is_refused() -> None:
     def averages(parameters: Any, draws: Any) -> Any:
         return {"error_m": draws.normal("x", (3,)).mean()}
 
-    with pytest.raises(ConfigError, match=r"each of the 2 trials, got torch.float64 of shape \(\); reduce over the last"):
+    with pytest.raises(
+        ConfigError, match=r"each of the 2 trials, got torch.float64 of shape \(\); reduce over the last"
+    ):
         sweep(averages, {"a": [1.0]}, trials=2, chunk=2)
 
 

@@ -225,10 +225,13 @@ def _with_jumps(
         The pulses without the jumps, the smooth shifts, their standard deviation, which includes
         what single pulses leave open, and the jumps in whole cells, in the same shapes.
     """
-    jump = torch.zeros_like(smooth)
+    jump, moved = torch.zeros_like(smooth), pulses.moved(smooth)
     apart = likeliest_jumps(pulses, smooth, jump)[1]
+    # a gate that follows the target leaves no pulse a whole cell apart, but most of them a part
+    step = pulses.peak(moved * pulses.likelihood(moved.sum(-2, keepdim=True) / pulses.count).conj()).abs()
+    step = torch.where(pulses.present, step, torch.nan).nanmedian(-1).values
     # jumps of less rms size, in cells, cost no accuracy that matters
-    open_to_jumps = apart > 0.02
+    open_to_jumps = (apart > 0.02) | (step > 0.1)
     at = true_positions(open_to_jumps, host_value(open_to_jumps.sum(), len(apart)))
     if len(at):
         some, some_lines = Envelopes(pulses.spectra[at], pulses.present[at], pulses.n), lines[at]
