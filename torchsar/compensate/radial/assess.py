@@ -121,7 +121,7 @@ def _tones(sweeps: Tensor, raw_m_s: Tensor, radar: TriangularLadar, pulse: Axis)
         rest = rest - steady.mean(-1)[..., None, None] * unit[..., None, :, :]
     pairs = torch.stack([f + other for f in cycles for other in cycles], -1)[..., None, :]
     turns = raw_m_s[..., None] * (4 / (radar.wavelength_m * radar.sample_rate_hz)) - pairs
-    return torch.stack(shares).sum(0), ((turns - torch.round(turns)).abs() < 0.2 / n).any(-1)
+    return torch.stack(shares).sum(0), ((turns - torch.round(turns)).abs() < 1 / n).any(-1)
 
 
 def _one_sided(lines: Tensor, lit: Tensor) -> Tensor:
