@@ -385,8 +385,8 @@ def robust_fit(values: Tensor, basis: Tensor, weight: Tensor, iterations: int = 
         if iteration < iterations // 2:
             now = weight / residual.clamp_min(0.1)
         else:
-            # The constant is far below any jitter. The usual factor of 4.685 gives 95 % efficiency
-            # for normal errors.
+            # 1e-3 keeps the scale above zero when most residuals vanish. The usual factor of 4.685
+            # of Tukey's biweight gives 95 % efficiency for normal errors.
             scale = 4.685 * (robust_std(residual, weight > 0) + 1e-3)
             now = weight * (1 - (residual / scale).square()).clamp_min(0).square()
     return coefficients

@@ -153,7 +153,11 @@ def spread_of(
 def _errors(
     trace: Trace, uses: Uses, in_doubt: Mapping[str, str], of: Collection[str] | None
 ) -> tuple[dict[tuple[str, str], _Error], str]:
-    """Errors of values that stages use, by estimate and value, and the first of these stages."""
+    """Collect the errors of all estimated values that later stages use and that have a deviation.
+
+    Returns them by (name of the estimate, name of the value), and the name of the first stage that
+    uses one, from which the chain is repeated.
+    """
     sources = {name: {source.partition(".")[::2] for source in names.values()} for name, names in uses.items()}
     if isinstance(of, str):
         raise ValueError(f"`of` must be a collection of names of estimates, got the text {of!r}; write [{of!r}]")

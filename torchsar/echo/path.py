@@ -246,7 +246,10 @@ def simulate_path(
 
 @dataclass(frozen=True)
 class _Flown:
-    """True and recorded paths, which have the same reference."""
+    """Antenna paths of a flight, true and as navigation records them.
+
+    The phases of both refer to the same path length, `reference_m`.
+    """
 
     true: AntennaPath
     recorded: AntennaPath

@@ -182,7 +182,10 @@ def reproduce(papers: str | None, label: str | None, out: Path, small: bool = Fa
 
 
 def _made(one: Paper, wanted: Sequence[Item], entries: dict[str, Any], out: Path, small: bool) -> str:
-    """Make some items of a paper, and return their table as text."""
+    """Make the wanted figures and tables of a paper, and record each of them in its JSON file.
+
+    Returns the comparison with the published values, as a table in text form.
+    """
     folder, results = out / one.name, dict[Callable[[bool], Any], Any]()
     folder.mkdir(parents=True, exist_ok=True)
     for item in wanted:

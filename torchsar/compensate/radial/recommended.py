@@ -178,12 +178,12 @@ def _unwrapped(phase: Tensor, lit: Tensor) -> Tensor:
 
 @torch.no_grad()
 def _start(cells: Tensor, coarse: Estimate, enough: Tensor, radar: TriangularLadar, pulse: Axis) -> Tensor | None:
-    """Phases (..., pulse) by PGA for trials in which the error of integrated velocities exceeds 0.4
-    rad.
+    """Estimate starting phases (..., pulse) by PGA where the velocities alone are too inaccurate.
 
-    The limit, found by trial, applies to the predicted random walk of the integrated velocities.
-    Beyond a radian, `phase_polish` alone may end in an image of two peaks. The phases are zero for
-    the other trials, and for less than 32 periods, because the first window is as wide.
+    That is where integrating their noise predicts a phase error above 0.4 rad, found by trial;
+    from about 1 rad on, `phase_polish` may end in an image of two peaks. Other trials get zeros.
+    The result is None if no trial needs PGA, or for fewer than 32 periods, because the first PGA
+    window is 31 cells wide.
     """
     walk_m = integrated_range_detrended_bound_m(coarse.info["noise_m_s"], pulse.step, pulse.n)
     far = enough & (4 * math.pi / radar.wavelength_m * walk_m > 0.4)

@@ -190,8 +190,8 @@ def _choose_slope(scene: Scene, sampled: Sampled, error: float) -> tuple[tuple[i
         if found and oversampling * cells > min(found)[0]:
             break  # no slope is short enough
         per_metre = scene.samples_per_metre(oversampling)
-        # Share of the sampled band that no wave number of a stretched pulse enters. It is rounded
-        # down so that few windows are tabulated.
+        # The guard is the share of the sampled band that stays empty even for the most stretched
+        # pulse. It is rounded down to 1/64, so that similar scenes share one tabulated window.
         share = 1 - (max(high - carrier, carrier - low) + carrier * most) / (math.pi * per_metre)
         guard, turns = math.floor(64 * share) / 64, scene.sample_turns(oversampling, sampled.stretch)
         away, reach = sampled.away_m * per_metre, sampled.reach_m * per_metre

@@ -373,7 +373,8 @@ def _fit_of_points(
     left = x - (amplitude[..., None, :] @ s)[..., 0, :]
     slopes = phase_slopes(radar, motion, time_s, unknowns)
     columns = (amplitude[..., None, None, None] * 1j * slopes * echo[..., None, :, :]).flatten(-2).flatten(-3, -2)
-    # the parts that changes of the amplitudes would explain are removed
+    # Each derivative loses the part that changed amplitudes could also explain. The gradient is
+    # then that of the fit with the best amplitudes at every motion.
     columns = columns - solved(gram, s.conj() @ columns.mT).mT @ s
     return PointFit(
         amplitude,

@@ -489,7 +489,7 @@ WORLD = {
     "IMPAIRMENTS (geo, geo_ocean)": MULTICHANNEL_IMPAIRMENTS,
 }
 
-# base classes of other stages, and stages whose result is no signal
+# Names that are not listed as stages: a base class, and a stage whose result is no signal.
 _NO_STAGES = ("path_image", "image_movers")
 # stages that functions build from plain keys, by the package where they are listed
 _BUILT = {

@@ -26,11 +26,12 @@ from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Alternative, Choice, DirectlySummed, Measured, beside_direct_sum, ladar_strip
 from torchsar.study.trials.system import Noise
 
-# limits that concern only methods with a stage whose key has the given value
+# Stage, key and value that a method must have for the limit to concern it.
 _CONCERNS = {
     "SNR after compression": ("segmented_interference", "unwrap", "gradient"),
     "spacing of scatterers": ("segmented_interference", "bins", "peak"),
-    # no stage, because estimators remove most of the velocity first
+    # The limit on the speed concerns no stage, so the empty names match none. Estimators remove
+    # most of the velocity of the mirror first.
     "speed of the mirror tone": ("", "", ""),
 }
 # echo models, the cheapest first: level of detail, effect that is left out, row of the requirements
