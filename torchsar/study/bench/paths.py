@@ -122,7 +122,7 @@ def strip_autofocus(data: Signal, **known: Tensor) -> Estimate:
 
 
 def pathless(run: Callable[[Signal], Any]) -> Callable[..., Any]:
-    """A method that is not told the path."""
+    """A method that does not know the path."""
     return lambda data, **_: run(data)
 
 
